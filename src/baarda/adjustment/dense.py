@@ -1,0 +1,113 @@
+"""The dense solver: Cholesky factor of the scaled normal equations with LAPACK; for small networks and as an oracle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from baarda.adjustment.linearize import Linearization
+from baarda.errors import Singular
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class DenseSolver:
+    """A factored normal matrix; see `baarda.adjustment.kernels.Solver` for the contract."""
+
+    lin: Linearization
+    kept: Ints
+    factor: Floats
+    scale: Floats
+    rcond: float
+
+    @staticmethod
+    def of(lin: Linearization, held: Ints, damping: float = 0.0) -> DenseSolver:
+        """Factor the normal equations with some unknowns held fixed.
+
+        Raises
+        ------
+        Singular
+            If unknowns are not determined; names the unknowns of the null space.
+        """
+        kept = np.setdiff1d(np.arange(lin.unknowns.count), held)
+        scale = lin.scale[kept]
+        a = lin.design[:, kept].toarray() / scale
+        normal = a.T @ a
+        factor, rcond = factorise(normal + damping * np.eye(len(kept)), [kept], lin)
+        return DenseSolver(lin, kept, factor, scale, rcond)
+
+    def solve(self, rhs: Floats) -> Floats:
+        """Return N^-1 rhs for (u,) or (u, k) right-hand sides; held unknowns stay zero."""
+        columns = rhs.reshape(len(rhs), -1)
+        out = np.zeros_like(columns)
+        out[self.kept] = linalg.cho_solve((self.factor, True), columns[self.kept] / self.scale[:, None]) / self.scale[:, None]
+        return out.reshape(rhs.shape)
+
+    def hat(self) -> list[Floats]:
+        """Return for each chunk the (N, m, m) diagonal blocks of A N^-1 A'."""
+        out = []
+        for c in self.lin.chunks:
+            n, m = c.misclosure.shape
+            rows = self.lin.design[c.rows.ravel()][:, self.kept].toarray() / self.scale
+            half = linalg.solve_triangular(self.factor, rows.T, lower=True).T.reshape(n, m, -1)
+            out.append(np.asarray(half @ half.transpose(0, 2, 1)))
+        return out
+
+    def blocks(self, columns: Ints) -> Floats:
+        """Return the (N, w, w) blocks of N^-1 for (N, w) columns; zero for columns below zero and held ones."""
+        inverse = self._inverse()
+        place = np.full(self.lin.unknowns.count + 1, len(self.kept))
+        place[self.kept] = np.arange(len(self.kept))
+        at = place[columns]
+        return np.asarray(inverse[at[:, :, None], at[:, None, :]])
+
+    def _inverse(self) -> Floats:
+        n = len(self.kept)
+        out = np.zeros((n + 1, n + 1))
+        half, _ = linalg.lapack.dtrtri(self.factor, lower=1)
+        half = np.tril(half)
+        out[:n, :n] = (half.T @ half) / np.outer(self.scale, self.scale)
+        return out
+
+
+def factorise(matrix: Floats, columns: list[Ints], lin: Linearization) -> tuple[Floats, float]:
+    """Cholesky-factor a scaled normal matrix; return the lower factor and the reciprocal condition number.
+
+    Parameters
+    ----------
+    matrix : (k, k) array
+        Unit diagonal before elimination.
+    columns : list of int arrays
+        The unknowns of the rows, for the names in an error.
+
+    Raises
+    ------
+    Singular
+        If a null space shows that unknowns are not determined.
+    """
+    if not len(matrix):
+        return matrix, 1.0
+    factor, info = linalg.lapack.dpotrf(matrix, lower=1, clean=1)
+    if info == 0:
+        rcond, _ = linalg.lapack.dpocon(factor, np.abs(matrix).sum(axis=0).max(), uplo="L")
+        if rcond > 1e-14:
+            return factor, float(rcond)
+    names = lin.unknowns.names
+    values, vectors = linalg.eigh(matrix)
+    limit = len(matrix) * np.finfo(float).eps * values[-1]
+    null = vectors[:, values <= limit]
+    if not null.shape[1]:
+        if info == 0:
+            return factor, float(rcond)
+        null = vectors[:, :1]
+    at = np.concatenate(columns)
+    share = (null**2).sum(axis=1)
+    order = np.argsort(-share, kind="stable")
+    hit = [names[at[i]] for i in order if share[i] > 0.02 * share.max()]
+    shown = ", ".join(hit[:12]) + (f" and {len(hit) - 12} more" if len(hit) > 12 else "")
+    raise Singular(f"the observations do not determine {len(null.T)} combination(s) of unknowns; involved: {shown}", hit)

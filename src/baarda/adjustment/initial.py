@@ -1,0 +1,256 @@
+"""Start values for what a network does not know: resection, intersection, relative orientation to spread through the block.
+
+Images that see enough known points are resected; points that enough oriented images see are intersected; both alternate. Where nothing
+is known, or no image sees enough of it, a pair of images is oriented relatively and the model is carried on from there; a model that
+stands free of the control is moved onto it by a similarity transformation as soon as three control points lie in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from baarda.cameras import Optics
+from baarda.errors import BaardaError, Singular, UsageError
+from baarda.geometry.intersection import PointStatus, intersect
+from baarda.geometry.relative_orientation import relative_orientation
+from baarda.geometry.resection import resect
+from baarda.geometry.similarity import similarity
+from baarda.network import Network
+from baarda.observations import ImagePoints
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.intp]
+
+ENOUGH = 4  # points for a resection
+
+
+def complete(network: Network, aside: Bools) -> tuple[Network, list[str]]:
+    """Return the network with start values for everything that takes part.
+
+    Parameters
+    ----------
+    network : Network
+    aside : (points,) bool array
+        Points that do not take part.
+
+    Returns
+    -------
+    network : Network
+    notes : list of str
+        Where start values came from.
+
+    Raises
+    ------
+    Singular
+        If images or points are left without start values; names them.
+    UsageError
+        If there are no image points to find them with.
+    """
+    images, points = network.images, network.points
+    missing_images = np.asarray(~(np.isfinite(images.position).all(axis=1) & np.isfinite(images.rotation).all(axis=(1, 2))))
+    missing_points = np.asarray(~np.isfinite(points.coordinates).all(axis=1) & ~aside)
+    if not (missing_images.any() or missing_points.any()):
+        return network, []
+    search = _Search(network, aside, ~missing_images, ~missing_points & ~aside)
+    search.run()
+    left = [f"image {images.labels[i]}" for i in np.flatnonzero(~search.oriented)]
+    left += [f"point {points.labels[i]}" for i in np.flatnonzero(~search.known & ~aside)]
+    if left:
+        shown = ", ".join(left[:12]) + (f" and {len(left) - 12} more" if len(left) > 12 else "")
+        raise Singular(f"no start values found for {len(left)} image(s) or point(s): {shown}{search.why}", left)
+    notes = []
+    if missing_images.any():
+        notes.append(f"start values of {int(missing_images.sum())} image(s) by {' and '.join(search.methods)}")
+    if missing_points.any():
+        notes.append(f"start values of {int(missing_points.sum())} point(s) by intersection")
+    network = replace(
+        network,
+        images=replace(images, position=search.position, rotation=search.rotation),
+        points=replace(points, coordinates=search.coordinates),
+    )
+    return network, notes
+
+
+class _Search:
+    """The state of the search: what is oriented, what is known, and the normalised image coordinates of all rays."""
+
+    def __init__(self, network: Network, aside: Bools, oriented: Bools, known: Bools) -> None:
+        groups = [g for g in network.observations if isinstance(g, ImagePoints)]
+        if not groups:
+            raise UsageError("start values are missing and there are no image points to find them with")
+        self.network = network
+        self.image = np.concatenate([g.images for g in groups])
+        self.point = np.concatenate([g.points for g in groups])
+        use = ~aside[self.point]
+        pixels, sigmas = np.concatenate([g.xy for g in groups])[use], np.concatenate([g.sigmas for g in groups])[use]
+        self.image, self.point = self.image[use], self.point[use]
+        self.xy, valid = _normalised(network, self.image, pixels)
+        distance = np.array([_distance(network, i) for i in range(len(network.images.labels))])
+        self.sigma = sigmas / distance[self.image][:, None]
+        self.image, self.point, self.xy, self.sigma = self.image[valid], self.point[valid], self.xy[valid], self.sigma[valid]
+        self.oriented, self.known = oriented.copy(), known.copy()
+        self.fixed_frame = bool(known.any() or oriented.any())
+        self.given = known.copy()
+        self.position, self.rotation = np.array(network.images.position), np.array(network.images.rotation)
+        self.coordinates = np.array(network.points.coordinates)
+        self.methods: list[str] = []
+        self.why = ""
+
+    def run(self) -> None:
+        """Alternate until nothing more is found."""
+        while True:
+            progress = self.resect_all() or self.intersect_all()
+            if progress:
+                continue
+            if self.oriented.all() and (self.known | ~self.seen()).all():
+                return
+            if not self.start_model():
+                return
+
+    def seen(self) -> Bools:
+        """Return which points have a ray."""
+        return np.asarray(np.bincount(self.point, minlength=len(self.known)) > 0)
+
+    def resect_all(self) -> bool:
+        """Resect the images that see the most known points; those that see clearly fewer wait for the next round."""
+        usable = self.known[self.point]
+        counts = np.bincount(self.image[usable], minlength=len(self.oriented))
+        waiting = np.flatnonzero(~self.oriented & (counts >= ENOUGH))
+        if not len(waiting):
+            return False
+        chosen = waiting[counts[waiting] >= 0.5 * counts[waiting].max()]
+        done = False
+        for i in chosen:
+            rows = np.flatnonzero(usable & (self.image == i))
+            try:
+                pose = resect(self.xy[rows], self.coordinates[self.point[rows]])
+            except BaardaError as error:
+                self.why = f" (image {self.network.images.labels[i]}: {error})"
+                continue
+            self.position[i], self.rotation[i] = pose.position, pose.rotation
+            self.oriented[i] = done = True
+        if done:
+            self._method("resection")
+        elif len(waiting) > len(chosen):
+            self.oriented[chosen] = False
+        return done
+
+    def intersect_all(self, min_angle: float = 0.02) -> bool:
+        """Intersect unknown points; small angles only when nothing else is left."""
+        wanted = ~self.known[self.point] & self.oriented[self.image]
+        rows = np.flatnonzero(wanted)
+        if not len(rows):
+            return False
+        for angle in (min_angle, 1e-3, 1e-5):
+            found = intersect(
+                self.xy[rows],
+                self.rotation[self.image[rows]],
+                self.position[self.image[rows]],
+                self.point[rows],
+                len(self.known),
+                sigmas=self.sigma[rows],
+                min_angle=angle,
+            )
+            good = found.status == PointStatus.OK
+            if good.any():
+                self.coordinates[good], self.known[good] = found.points[good], True
+                return True
+        return False
+
+    def start_model(self) -> bool:
+        """Orient a pair of images relatively: in the free network, or as a model that is then moved onto the control."""
+        if self.fixed_frame:
+            return self._model_on_control()
+        pair = self._best_pair(np.ones(len(self.oriented), dtype=bool))
+        if pair is None:
+            return False
+        first, second, model = pair
+        self.position[first], self.rotation[first] = 0.0, np.eye(3)
+        self.position[second], self.rotation[second] = model.base, model.rotation
+        self.oriented[[first, second]] = True
+        self.fixed_frame = True
+        self._method("relative orientation")
+        return True
+
+    def _best_pair(self, allowed: Bools):  # type: ignore[no-untyped-def]
+        """Return the pair with many common points and a large angle between the rays."""
+        sets = {int(i): np.flatnonzero(self.image == i) for i in np.flatnonzero(allowed)}
+        shared = []
+        for i, j in combinations(sets, 2):
+            count = len(np.intersect1d(self.point[sets[i]], self.point[sets[j]], assume_unique=False))
+            if count >= 6:
+                shared.append((count, i, j))
+        best = None
+        for count, i, j in sorted(shared, key=lambda s: (-s[0], s[1], s[2]))[:12]:
+            common, a, b = np.intersect1d(self.point[sets[i]], self.point[sets[j]], return_indices=True)
+            try:
+                model = relative_orientation(self.xy[sets[i][a]], self.xy[sets[j][b]])
+            except BaardaError as error:
+                self.why = f" ({error})"
+                continue
+            points = model.points[np.isfinite(model.points).all(axis=1)]
+            if not len(points):
+                continue
+            depth = float(np.median(np.linalg.norm(points, axis=1)))
+            score = len(points) * min(1.0, 1.0 / max(depth, 1e-12) / 0.3)
+            if best is None or score > best[0]:
+                best = (score, i, j, model)
+            del common, count
+        return None if best is None else best[1:]
+
+    def _model_on_control(self) -> bool:
+        """Build a free model of the images that are left, then move it onto what is known."""
+        free = _Search.__new__(_Search)
+        free.__dict__.update({k: (v.copy() if isinstance(v, np.ndarray) else v) for k, v in self.__dict__.items()})
+        free.oriented, free.known = np.zeros_like(self.oriented), np.zeros_like(self.known)
+        free.fixed_frame, free.methods = False, []
+        free.run_free()
+        common = free.known & self.known
+        if common.sum() < 3:
+            self.why = self.why or " (fewer than three known points lie in the model of the images)"
+            return False
+        try:
+            move = similarity(free.coordinates[common], self.coordinates[common])
+        except BaardaError as error:
+            self.why = f" ({error})"
+            return False
+        new = free.oriented & ~self.oriented
+        self.position[new] = move.apply(free.position[new])
+        self.rotation[new] = free.rotation[new] @ move.rotation.T
+        self.oriented |= new
+        self._method("relative orientation")
+        return bool(new.any())
+
+    def run_free(self) -> None:
+        """Grow one free model as far as it goes."""
+        if not self.start_model():
+            return
+        while self.resect_all() or self.intersect_all():
+            pass
+
+    def _method(self, name: str) -> None:
+        if name not in self.methods:
+            self.methods.append(name)
+
+
+def _normalised(network: Network, image: Ints, pixels: Floats) -> tuple[Floats, Bools]:
+    """Return normalised coordinates of all rays and whether the distortion could be inverted."""
+    out, valid = np.empty_like(pixels), np.empty(len(pixels), dtype=bool)
+    camera = network.images.cameras[image]
+    for i in np.unique(camera):
+        rows = camera == i
+        c = network.cameras[i]
+        out[rows], valid[rows] = Optics.of(c).correct(pixels[rows], c.values[None])
+    return out, valid
+
+
+def _distance(network: Network, image: int) -> float:
+    """Return the principal distance of an image's camera in source pixels."""
+    c = network.cameras[network.images.cameras[image]]
+    value = next((v for name, v in zip(c.model.order, c.values, strict=True) if name.startswith("principal_distance")), 1.0)
+    return float(value / c.pixel_size[0])

@@ -1,0 +1,496 @@
+"""What an adjustment found: unknowns, residuals, redundancy numbers, any block of the covariance matrix, and the evidence for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from baarda.adjustment.covariance import Cofactors
+from baarda.adjustment.datum import Datum
+from baarda.adjustment.kernels import Solver
+from baarda.adjustment.linearize import Linearization, offsets_of
+from baarda.cameras import STATES
+from baarda.errors import UsageError
+from baarda.geometry import rotation as rot
+from baarda.hypotheses.base import Estimates, Evidence
+from baarda.network import AXES, CHECK, ROLES, Network, State, Table, Unknowns
+from baarda.observations import CorrelatedPoints, Direct, ImagePoints, Kind
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+Scaling = Literal["apriori", "aposteriori"]
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One step: v'Pv after it, the relative step, Levenberg's damping, and whether the step was taken."""
+
+    count: int
+    objective: float
+    relative_step: float | None
+    damping: float
+    accepted: bool
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """A network adjusted by least squares.
+
+    Attributes
+    ----------
+    network : Network
+        With adjusted values.
+    start : Network
+        With start values.
+    numbering : Unknowns
+        Names and columns of the unknowns.
+    groups : tuple of observation groups
+        All observations that took part, direct ones included.
+    lin : Linearization
+        The whitened system at the solution, coordinates reduced by `shift`.
+    solver : Solver
+        Its factor.
+    datum : Datum
+    redundancy : int
+        r = n - u + d.
+    history : tuple of Iteration
+    status : {"converged", "not_converged"}
+    aside : (points,) bool array
+        Points set aside.
+    assumptions : tuple of str
+    """
+
+    network: Network
+    start: Network
+    numbering: Unknowns
+    groups: tuple[Kind, ...]
+    lin: Linearization
+    solver: Solver
+    solver_name: str
+    datum: Datum
+    redundancy: int
+    history: tuple[Iteration, ...]
+    status: str
+    aside: NDArray[np.bool_]
+    assumptions: tuple[str, ...]
+    shift: Floats
+
+    # ---- numbers of the whole ----
+    @property
+    def count(self) -> int:
+        """The number n of observations."""
+        return self.lin.count
+
+    @property
+    def objective(self) -> float:
+        """v'Pv."""
+        return float(self.lin.misclosure @ self.lin.misclosure)
+
+    @property
+    def variance_factor(self) -> float:
+        """The a-posteriori variance factor s0^2 = v'Pv / r."""
+        return self.objective / self.redundancy
+
+    @property
+    def sigma0(self) -> float:
+        """The a-posteriori standard deviation of unit weight (a priori it is 1)."""
+        return float(np.sqrt(self.variance_factor))
+
+    def scale(self, sigma: Scaling) -> float:
+        """Return sigma0 a priori (1) or a posteriori."""
+        if sigma not in ("apriori", "aposteriori"):
+            raise UsageError(f"sigma must be 'apriori' or 'aposteriori', not {sigma!r}")
+        return 1.0 if sigma == "apriori" else self.sigma0
+
+    # ---- observations ----
+    @cached_property
+    def offsets(self) -> Ints:
+        """First scalar row of each group, and n."""
+        return offsets_of(self.groups)
+
+    @cached_property
+    def residuals(self) -> Floats:
+        """v = adjusted - observed of all n observations, each in its unit."""
+        out = np.empty(self.count)
+        for c in self.lin.chunks:
+            out[c.rows] = -(c.factor @ c.misclosure[:, :, None])[:, :, 0]
+        return out
+
+    @cached_property
+    def sigmas(self) -> Floats:
+        """A-priori standard deviations of all n observations."""
+        return np.concatenate([g.sigma().ravel() for g in self.groups])
+
+    @cached_property
+    def _statistics(self) -> dict[str, Floats]:
+        """Diagonals of Qvv, Qvv P and P Qvv P, and P v, from the blocks I - H of whitened residuals."""
+        out = {name: np.empty(self.count) for name in ("qvv", "redundancy", "pqvvp", "pv")}
+        with threadpool_limits(limits=1, user_api="blas"):
+            hats = self.solver.hat()
+        for c, hat in zip(self.lin.chunks, hats, strict=True):
+            rest = np.eye(hat.shape[1]) - hat
+            inverse = np.linalg.inv(c.factor)
+            left = c.factor @ rest
+            weighted = inverse.transpose(0, 2, 1)
+            out["qvv"][c.rows] = np.einsum("nij,nij->ni", left, c.factor)
+            out["redundancy"][c.rows] = np.einsum("nij,nji->ni", left, inverse)
+            out["pqvvp"][c.rows] = np.einsum("nij,nji->ni", weighted @ rest, inverse)
+            out["pv"][c.rows] = -(weighted @ c.misclosure[:, :, None])[:, :, 0]
+        return out
+
+    @property
+    def redundancy_numbers(self) -> Floats:
+        """r_i = (Qvv P)_ii of all n observations; they sum to r."""
+        return self._statistics["redundancy"]
+
+    @property
+    def qvv(self) -> Floats:
+        """Diagonal of the cofactor matrix of the residuals."""
+        return self._statistics["qvv"]
+
+    def residuals_of(self, errors: Floats) -> Floats:
+        """Map standardised errors (n, k), whitened and independent, to standardised residuals -Qvv P e, each divided by its sigma."""
+        with threadpool_limits(limits=1, user_api="blas"):
+            white = self.lin.design @ self.solver.solve(self.lin.design.T @ errors) - errors
+        correlated = [c for c in self.lin.chunks if c.factor.shape[1] > 1 and np.any(np.tril(c.factor, -1))]
+        for c in correlated:
+            values = np.einsum("nij,njk->nik", c.factor, white[c.rows])
+            white[c.rows] = values / self.sigmas[c.rows][:, :, None]
+        return np.asarray(white)
+
+    def _codes(self) -> dict[str, Any]:
+        """Group, image and point codes and component names of all observations."""
+        n = self.count
+        out: dict[str, Any] = {"group": np.empty(n, dtype=np.intp), "image": np.full(n, -1), "point": np.full(n, -1)}
+        component = np.empty(n, dtype=object)
+        for g, group in enumerate(self.groups):
+            rows = slice(self.offsets[g], self.offsets[g + 1])
+            m = len(group.components)
+            labels = group.labels(self.network)
+            out["group"][rows] = g
+            for kind in ("image", "point"):
+                if kind in labels:
+                    out[kind][rows] = np.repeat(labels[kind], m)
+            component[rows] = np.repeat(labels["component"], m) if "component" in labels else np.tile(group.components, len(group))
+        out["component"] = component
+        return out
+
+    @cached_property
+    def observations(self) -> Table:
+        """One row per scalar observation: group, image, point, component, observed, sigma, residual, redundancy."""
+        codes = self._codes()
+        images, points = (
+            np.array([*self.network.images.labels, ""], dtype=object),
+            np.array([*self.network.points.labels, ""], dtype=object),
+        )
+        observed = np.concatenate([g.observed().ravel() for g in self.groups])
+        direct = np.concatenate([np.full(len(g) * len(g.components), isinstance(g, (Direct, CorrelatedPoints))) for g in self.groups])
+        observed = observed - np.where(direct, self._shift_of(codes), 0.0)
+        return Table(
+            {
+                "group": np.array([g.name for g in self.groups], dtype=object)[codes["group"]],
+                "image": images[codes["image"]],
+                "point": points[codes["point"]],
+                "component": codes["component"],
+                "observed": observed,
+                "sigma": self.sigmas,
+                "residual": self.residuals,
+                "redundancy": self.redundancy_numbers,
+            }
+        )
+
+    def _shift_of(self, codes: dict[str, Any]) -> Floats:
+        """What the reduction to the centroid added to each directly observed coordinate."""
+        axis = {"X": 0, "Y": 1, "Z": 2, "X0": 0, "Y0": 1, "Z0": 2}
+        shift = np.append(self.shift, 0.0)
+        return np.asarray(shift[[axis.get(c, 3) for c in codes["component"]]])
+
+    # ---- unknowns ----
+    @cached_property
+    def cofactors(self) -> Cofactors:
+        """Cofactors of the unknowns in the datum chosen."""
+        return Cofactors(self.solver, self.datum, self.numbering.count)
+
+    def covariance(self, a: str | Sequence[str], b: str | Sequence[str] | None = None, sigma: Scaling = "aposteriori") -> Any:
+        """Return covariances of named unknowns.
+
+        Parameters
+        ----------
+        a, b : str or sequence of str
+            Names like ``"camera 1: K1"``; without b the covariance matrix of a.
+        sigma : {"aposteriori", "apriori"}
+            Which variance factor scales the cofactors.
+
+        Returns
+        -------
+        float or (len(a), len(b)) array
+            A number if both are single names. Image angles are increments about the camera axes (radians).
+
+        Raises
+        ------
+        UsageError
+            If a name is not that of an unknown.
+        """
+        b = a if b is None else b
+        columns = [np.array([self.numbering.column(n) for n in ([x] if isinstance(x, str) else x)]) for x in (a, b)]
+        block = self.scale(sigma) ** 2 * self.cofactors.of(columns[0], columns[1])
+        return float(block[0, 0]) if isinstance(a, str) and isinstance(b, str) else block
+
+    def _blocks(self, kind: str, width: int) -> Floats:
+        group = self.numbering[kind]
+        return self.cofactors.blocks(group.columns.reshape(-1, width))
+
+    @cached_property
+    def _point_cofactors(self) -> Floats:
+        return self._blocks("point", 3)
+
+    @cached_property
+    def _image_cofactors(self) -> Floats:
+        """(images, 6, 6) cofactors of X0 Y0 Z0 omega phi kappa; NaN for angles at the singularity."""
+        q = self._blocks("image", 6)
+        t = np.zeros((len(q), 6, 6))
+        t[:, :3, :3] = np.eye(3)
+        t[:, 3:, 3:] = rot.angle_partials(self.network.images.rotation)
+        return np.asarray(t @ q @ t.transpose(0, 2, 1))
+
+    @cached_property
+    def camera_estimates(self) -> Estimates:
+        """All estimated camera parameters with their joint cofactors."""
+        return self._camera_estimates(additional_only=False)
+
+    def _camera_estimates(self, additional_only: bool) -> Estimates:
+        group = self.numbering["camera"]
+        names, values, columns, labels = [], [], [], []
+        for i, camera in enumerate(self.network.cameras):
+            for k, name in enumerate(camera.model.order):
+                column = group.columns[group.offsets[i] + k]
+                if column >= 0 and (camera.model.additional[k] or not additional_only):
+                    names.append(f"camera {camera.label}: {name}")
+                    values.append(camera.values[k])
+                    columns.append(column)
+                    labels.append(camera.label)
+        at = np.array(columns, dtype=np.intp)
+        q = self.cofactors.of(at) if len(at) else np.zeros((0, 0))
+        return Estimates(tuple(names), np.array(values, dtype=float), 0.5 * (q + q.T), None, tuple(labels))
+
+    def _check_estimates(self) -> Estimates | None:
+        points = self.network.points
+        rows, axes = np.nonzero(((points.roles == CHECK) & ~self.aside)[:, None] & np.isfinite(points.given))
+        if not len(rows):
+            return None
+        q = self.cofactors.of(self.numbering["point"].columns.reshape(-1, 3)[rows, axes])
+        covariance = points.covariance(np.arange(len(points.labels)))
+        same = rows[:, None] == rows[None, :]
+        reference = np.where(same, np.nan_to_num(covariance[rows[:, None], axes[:, None], axes[None, :]]), 0.0)
+        return Estimates(
+            tuple(f"point {points.labels[i]}: {AXES[k]}" for i, k in zip(rows, axes, strict=True)),
+            points.coordinates[rows, axes] - points.given[rows, axes],
+            0.5 * (q + q.T),
+            reference,
+            tuple(points.labels[i] for i in rows),
+        )
+
+    def _control_estimates(self) -> Estimates | None:
+        columns, names, labels, rows, cofactors = [], [], [], [], []
+        numbering = self.numbering["point"].columns.reshape(-1, 3)
+        for g, group in enumerate(self.groups):
+            if isinstance(group, Direct) and group.kind == "point":
+                nodes, axes = group.nodes, group.positions
+                cofactors.append(np.diag(group.sigmas**2))
+            elif isinstance(group, CorrelatedPoints):
+                nodes, axes = np.repeat(group.nodes, 3), np.tile(np.arange(3), len(group))
+                q = np.zeros((3 * len(group), 3 * len(group)))
+                for i, c in enumerate(group.covariances):
+                    q[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = c
+                cofactors.append(q)
+            else:
+                continue
+            columns.append(numbering[nodes, axes])
+            labels += [self.network.points.labels[i] for i in nodes]
+            names += [f"point {self.network.points.labels[i]}: {AXES[k]}" for i, k in zip(nodes, axes, strict=True)]
+            rows.append(np.arange(self.offsets[g], self.offsets[g + 1]))
+        if not columns:
+            return None
+        from scipy.linalg import block_diag
+
+        q = block_diag(*cofactors) - self.cofactors.of(np.concatenate(columns))
+        return Estimates(tuple(names), self.residuals[np.concatenate(rows)], 0.5 * (q + q.T), None, tuple(labels))
+
+    @cached_property
+    def evidence(self) -> Evidence:
+        """Everything that tests may ask for."""
+        codes = self._codes()
+        names = tuple(dict.fromkeys(codes["component"].tolist()))
+        index = {name: i for i, name in enumerate(names)}
+        image_rows = np.concatenate([np.full(len(g) * len(g.components), isinstance(g, ImagePoints)) for g in self.groups])
+        interior = self.camera_estimates
+        additional = self._camera_estimates(additional_only=True)
+        return Evidence(
+            residuals=self.residuals,
+            sigmas=self.sigmas,
+            vpv=self.objective,
+            redundancy=self.redundancy,
+            unknowns=self.numbering.count,
+            qvv=self.qvv,
+            redundancy_numbers=self.redundancy_numbers,
+            pv=self._statistics["pv"],
+            pqvvp=self._statistics["pqvvp"],
+            groups=codes["group"],
+            images=np.where(image_rows, codes["image"], -1),
+            points=codes["point"],
+            components=np.array([index[c] for c in codes["component"]], dtype=np.intp),
+            group_names=tuple(g.name for g in self.groups),
+            image_names=self.network.images.labels,
+            point_names=self.network.points.labels,
+            component_names=names,
+            additional=additional if additional.names else None,
+            interior=interior if interior.names else None,
+            check=self._check_estimates(),
+            control=self._control_estimates(),
+            residuals_of=self.residuals_of,
+        )
+
+    @cached_property
+    def unknowns(self) -> Table:
+        """One row per unknown: name, group, unit, value, sigma (a posteriori), initial, state."""
+        return self.unknown_table("aposteriori")
+
+    def unknown_table(self, sigma: Scaling) -> Table:
+        """Return the table of unknowns with sigmas of either variance factor."""
+        s0, numbering, net = self.scale(sigma), self.numbering, self.network
+        columns: dict[str, list[Any]] = {k: [] for k in ("name", "group", "unit", "value", "sigma", "initial", "state")}
+        order: list[int] = []
+
+        def add(column: int, *row: Any) -> None:
+            if column >= 0:
+                order.append(column)
+                for key, value in zip(columns, row, strict=True):
+                    columns[key].append(value)
+
+        camera = numbering["camera"]
+        q = {n: float(v) for n, v in zip(self.camera_estimates.names, np.diag(self.camera_estimates.cofactors), strict=True)}
+        for i, c in enumerate(net.cameras):
+            for k, name in enumerate(c.model.order):
+                full = f"camera {c.label}: {name}"
+                if full in q:
+                    state = STATES[c.states[k]]
+                    value = (full, "camera", c.unit_of(k), c.values[k], s0 * np.sqrt(q[full]), self.start.cameras[i].values[k], state)
+                    add(camera.columns[camera.offsets[i] + k], *value)
+        for kind, adjusted, first, states, units, cofactors in (
+            ("image", _exterior(net), _exterior(self.start), net.images.states, (net.unit,) * 3 + ("rad",) * 3, self._image_cofactors),
+            ("point", net.points.coordinates, self.start.points.coordinates, net.points.states, (net.unit,) * 3, self._point_cofactors),
+        ):
+            group = numbering[kind]
+            at = group.columns.reshape(adjusted.shape)
+            deviation = s0 * np.sqrt(np.einsum("nii->ni", cofactors))
+            for i, label in enumerate(group.labels):
+                names = group.parameters_of(i)
+                for k in np.flatnonzero(at[i] >= 0).tolist():
+                    row = (
+                        f"{kind} {label}: {names[k]}",
+                        kind,
+                        units[k],
+                        adjusted[i, k],
+                        deviation[i, k],
+                        first[i, k],
+                        STATES[states[i, k]],
+                    )
+                    add(at[i, k], *row)
+        arrays = {k: np.array(v, dtype=float if k in ("value", "sigma", "initial") else object) for k, v in columns.items()}
+        return Table({k: v[np.argsort(order, kind="stable")] for k, v in arrays.items()})
+
+    @cached_property
+    def points(self) -> Table:
+        """One row per object point that took part, sigmas a posteriori."""
+        return self.point_table("aposteriori")
+
+    def point_table(self, sigma: Scaling, probability: float = 0.95) -> Table:
+        """Return coordinates, sigmas, correlations, rays and the confidence ellipsoid and horizontal ellipse of the points.
+
+        The semi-axes are those of the region that covers the point with `probability`: factors sqrt(k F(k, r)) a posteriori, sqrt(chi2(k))
+        a priori, k = 3 for the ellipsoid and 2 for the ellipse; the azimuth of the major axis counts from +Y clockwise, radians.
+        """
+        from scipy import stats
+
+        s0 = self.scale(sigma)
+        points = self.network.points
+        use = np.flatnonzero(~self.aside)
+        c = s0**2 * self._point_cofactors[use]
+        s = np.sqrt(np.einsum("nii->ni", c))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            r = c / (s[:, :, None] * s[:, None, :])
+        rays = np.zeros(len(points.labels), dtype=int)
+        for g in self.groups:
+            if isinstance(g, ImagePoints):
+                rays += np.bincount(g.points, minlength=len(rays))
+        factor = [
+            np.sqrt(k * stats.f(k, self.redundancy).ppf(probability)) if sigma == "aposteriori" else np.sqrt(stats.chi2(k).ppf(probability))
+            for k in (2, 3)
+        ]
+        axes3 = factor[1] * np.sqrt(np.maximum(np.linalg.eigvalsh(c), 0.0))[:, ::-1]
+        values, vectors = np.linalg.eigh(c[:, :2, :2])
+        axes2 = factor[0] * np.sqrt(np.maximum(values, 0.0))[:, ::-1]
+        azimuth = np.mod(np.arctan2(vectors[:, 0, 1], vectors[:, 1, 1]), np.pi)
+        columns: dict[str, Any] = {
+            "point": np.array(points.labels, dtype=object)[use],
+            "role": np.array(ROLES)[points.roles[use]].astype(object),
+        }
+        columns |= {a: points.coordinates[use, k] for k, a in enumerate(AXES)} | {f"s{a}": s[:, k] for k, a in enumerate(AXES)}
+        columns |= {f"corr_{a}{b}": r[:, i, j] for a, b, i, j in (("X", "Y", 0, 1), ("X", "Z", 0, 2), ("Y", "Z", 1, 2))}
+        columns["rays"] = rays[use]
+        columns |= {f"ellipsoid_{name}": axes3[:, k] for k, name in enumerate("abc")}
+        columns |= {"ellipse_a": axes2[:, 0], "ellipse_b": axes2[:, 1], "ellipse_azimuth_rad": azimuth}
+        return Table(columns, dict.fromkeys((*AXES, "sX", "sY", "sZ"), self.network.unit))
+
+    @cached_property
+    def images(self) -> Table:
+        """One row per image, sigmas a posteriori."""
+        return self.image_table("aposteriori")
+
+    def image_table(self, sigma: Scaling) -> Table:
+        """Return exterior orientation with sigmas, number of points and rms of the residuals of each image."""
+        images = self.network.images
+        n = len(images.labels)
+        values = _exterior(self.network)
+        deviation = self.scale(sigma) * np.sqrt(np.einsum("nii->ni", self._image_cofactors))
+        count, square = np.zeros(n, dtype=int), np.zeros(n)
+        for g, group in enumerate(self.groups):
+            if isinstance(group, ImagePoints):
+                v = self.residuals[self.offsets[g] : self.offsets[g + 1]].reshape(-1, 2)
+                count += np.bincount(group.images, minlength=n)
+                square += np.bincount(group.images, weights=(v**2).sum(axis=1), minlength=n)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            rms = np.sqrt(square / (2 * count))
+        names = ("X0", "Y0", "Z0", "omega_rad", "phi_rad", "kappa_rad")
+        columns: dict[str, Any] = {
+            "image": np.array(images.labels, dtype=object),
+            "camera": np.array([c.label for c in self.network.cameras], dtype=object)[images.cameras],
+        }
+        columns |= {name: values[:, k] for k, name in enumerate(names)} | {f"s{name}": deviation[:, k] for k, name in enumerate(names)}
+        return Table(columns | {"points": count, "rms": rms})
+
+    @cached_property
+    def behind(self) -> list[tuple[str, str]]:
+        """Image and point of rays whose adjusted point lies behind the camera."""
+        out = []
+        state = State.of(self.network)
+        for group in self.groups:
+            if isinstance(group, ImagePoints):
+                for row in np.flatnonzero(~group.in_front(self.network, state)):
+                    out.append((self.network.images.labels[group.images[row]], self.network.points.labels[group.points[row]]))
+        return out
+
+    def with_assumptions(self, *more: str) -> Adjustment:
+        """Return the result with further assumptions for the report."""
+        return replace(self, assumptions=(*self.assumptions, *more))
+
+
+def _exterior(network: Network) -> Floats:
+    """(images, 6): X0 Y0 Z0 omega phi kappa."""
+    return np.concatenate([network.images.position, rot.to_angles(network.images.rotation)], axis=1)

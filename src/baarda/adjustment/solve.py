@@ -1,0 +1,328 @@
+"""The adjustment: from a network with start values to adjusted unknowns, residuals and the factored system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from baarda.adjustment.block import BlockSolver, eliminated_points
+from baarda.adjustment.datum import Datum, Defect, find_defect, minimal_columns
+from baarda.adjustment.dense import DenseSolver
+from baarda.adjustment.initial import complete
+from baarda.adjustment.kernels import Solver
+from baarda.adjustment.linearize import Linearization, check_finite, linearize, whitened_misclosures
+from baarda.adjustment.result import Adjustment, Iteration
+from baarda.cameras import FIXED, FREE
+from baarda.errors import DatumDefect, RedundancyNotPositive, UsageError
+from baarda.network import CHECK, Network, State, Unknowns, unknowns_of
+from baarda.observations import ImagePoints, Kind, direct_observations
+
+Floats = NDArray[np.float64]
+DENSE_LIMIT = 1500
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to adjust.
+
+    Attributes
+    ----------
+    datum : {"auto", "control", "inner", "minimal"}
+        Control defines the datum; inner constraints over all object points; minimal constraints; auto = control if it defines one,
+        else inner.
+    solver : {"auto", "dense", "block"}
+        auto = dense up to 1500 unknowns.
+    min_rays : int
+        Points with fewer rays and unknown coordinates are set aside and listed.
+    iterations : int
+        Limit of the number of steps, rejected ones included.
+    tolerance : float
+        Converged when the step changes the adjusted observations by less than this part of the residuals (both weighted norms).
+    camera : tuple of str or None
+        Interior and additional parameters to estimate; None leaves the states of the source, ``()`` fixes all.
+    image_sigma : float or None
+        Replaces the a-priori sigma of all image points, pixels.
+    residual_plane : {"image", "corrected"} or None
+        Replaces that of the source.
+    progress : callable or None
+        Is told every iteration.
+    """
+
+    datum: Literal["auto", "control", "inner", "minimal"] = "auto"
+    solver: Literal["auto", "dense", "block"] = "auto"
+    min_rays: int = 2
+    iterations: int = 50
+    tolerance: float = 1e-10
+    camera: tuple[str, ...] | None = None
+    image_sigma: float | None = None
+    residual_plane: str | None = None
+    progress: Callable[[Iteration], None] | None = field(default=None, compare=False)
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("datum", ("auto", "control", "inner", "minimal")), ("solver", ("auto", "dense", "block"))):
+            if getattr(self, name) not in allowed:
+                raise UsageError(f"{name} must be one of {', '.join(allowed)}, not {getattr(self, name)!r}")
+        if self.iterations < 1 or not self.tolerance > 0:
+            raise UsageError("iterations and tolerance must be positive")
+        if self.image_sigma is not None and not self.image_sigma > 0:
+            raise UsageError(f"the image sigma must be positive, not {self.image_sigma}")
+
+    @staticmethod
+    def of(network: Network, options: Mapping[str, Any]) -> Settings:
+        """Combine the settings found in a source with options, which win."""
+        known = {f.name for f in fields(Settings)}
+        unknown = [k for k in options if k not in known]
+        if unknown:
+            raise UsageError(f"unknown option {unknown[0]!r}; known are {', '.join(sorted(known))}")
+        found = {k: v for k, v in network.settings.items() if k in known}
+        return Settings(**{**found, **{k: v for k, v in options.items() if v is not None}})
+
+
+def adjust(network: Network, **options: Any) -> Adjustment:
+    """Adjust a network by least squares.
+
+    Parameters
+    ----------
+    network : Network
+        With or without start values.
+    **options
+        The fields of `Settings`; they win over the settings found in the source.
+
+    Returns
+    -------
+    Adjustment
+
+    Raises
+    ------
+    RedundancyNotPositive
+        If there are not more observations than unknowns.
+    DatumDefect
+        If control is to define the datum and does not.
+    Singular
+        If unknowns are not determined.
+    UsageError
+        If an option makes no sense, an image has no points, or a start value cannot be found.
+    """
+    settings = Settings.of(network, options)
+    with threadpool_limits(limits=1, user_api="blas"):  # two threads are slower here and sum in another order
+        return _adjust(network, settings)
+
+
+def _adjust(network: Network, settings: Settings) -> Adjustment:
+    prepared, aside, notes = prepare(network, settings)
+    prepared, more = complete(prepared, aside)
+    shift = -prepared.centroid()
+    prepared = prepared.shifted(shift)
+    groups = active_groups(prepared, ~aside)
+    unknowns = unknowns_of(prepared, ~aside, np.isin(np.arange(len(prepared.cameras)), prepared.images.cameras))
+    if not unknowns.count:
+        raise UsageError("nothing to adjust: all unknowns are fixed")
+
+    start = State.of(prepared)
+    lin = linearize(prepared, start, unknowns, groups)
+    check_finite(lin, groups, prepared)
+    defect = find_defect(lin, start)
+    redundancy = lin.count - unknowns.count + defect.count
+    if redundancy <= 0:
+        raise RedundancyNotPositive(
+            f"redundancy {redundancy}: n = {lin.count} observations, u = {unknowns.count} unknowns, "
+            f"datum defect d = {defect.count}; a test needs r = n - u + d > 0"
+        )
+    kind = settings.solver if settings.solver != "auto" else "dense" if unknowns.count <= DENSE_LIMIT else "block"
+
+    def factor(lin: Linearization, datum: Datum, damping: float = 0.0) -> Solver:
+        return (DenseSolver if kind == "dense" else BlockSolver).of(lin, datum.held, damping)
+
+    datum = choose_datum(defect, lin, settings, prepared)
+    state, lin, history, converged = _iterate(prepared, start, lin, groups, datum, factor, settings)
+    datum = choose_datum(find_defect(lin, state) if defect.count else defect, lin, settings, prepared)
+    solver = factor(lin, datum)
+    adjusted = state.write_to(prepared).shifted(-shift)
+    return Adjustment(
+        network=adjusted,
+        start=start.write_to(prepared).shifted(-shift),
+        numbering=unknowns,
+        groups=tuple(groups),
+        lin=lin,
+        solver=solver,
+        solver_name=kind,
+        datum=datum,
+        redundancy=redundancy,
+        history=tuple(history),
+        status="converged" if converged else "not_converged",
+        aside=aside,
+        assumptions=(*network.assumptions, *notes, *more),
+        shift=shift,
+    )
+
+
+def prepare(network: Network, settings: Settings) -> tuple[Network, NDArray[np.bool_], list[str]]:
+    """Apply the settings to a network: states of parameters and points, sigmas, points set aside.
+
+    Returns
+    -------
+    network : Network
+    aside : (points,) bool array
+        Points that do not take part.
+    notes : list of str
+        What was decided.
+    """
+    notes: list[str] = []
+    cameras = network.cameras
+    if settings.camera is not None:
+        cameras = tuple(_with_free(c, settings.camera) for c in cameras)
+        known = {name for c in cameras for name in c.model.order}
+        unknown = [name for name in settings.camera if name not in known]
+        if unknown:
+            raise UsageError(f"no camera has a parameter {unknown[0]!r}; known are {', '.join(sorted(known))}")
+    points = network.points
+    states = np.array(points.states)
+    states[points.roles == CHECK] = FREE
+    observations = []
+    for group in network.observations:
+        changed = group
+        if isinstance(group, ImagePoints):
+            if settings.image_sigma is not None:
+                changed = replace(changed, sigmas=np.full(changed.sigmas.shape, settings.image_sigma))
+            if settings.residual_plane is not None:
+                changed = replace(changed, residual_plane=settings.residual_plane)
+        observations.append(changed)
+    network = replace(network, cameras=cameras, points=replace(points, states=states), observations=tuple(observations))
+
+    rays = np.zeros(len(points.labels), dtype=int)
+    seen = np.zeros(len(network.images.labels), dtype=bool)
+    for group in network.observations:
+        if isinstance(group, ImagePoints):
+            rays += np.bincount(group.points, minlength=len(rays))
+            seen[group.images] = True
+    known = (states != FREE).all(axis=1)
+    measured = rays > 0
+    for group in network.observations:
+        for end in group.points_of():
+            measured[end] = True
+    aside = (~known & (rays < settings.min_rays)) | (known & ~measured)
+    if settings.min_rays == 0:
+        aside &= known
+    _say(notes, network, ~measured & aside, "without any observation, left out")
+    _say(notes, network, measured & aside, f"with fewer than {settings.min_rays} rays, set aside")
+    blind = np.flatnonzero(~seen & (network.images.states == FREE).any(axis=1))
+    if len(blind):
+        names = ", ".join(network.images.labels[i] for i in blind[:12])
+        raise UsageError(f"{len(blind)} image(s) without image points: {names}")
+    return network, aside, notes
+
+
+def _with_free(camera: Any, names: tuple[str, ...]) -> Any:
+    wanted = np.isin(camera.model.order, names)
+    states = np.where(wanted, np.where(camera.states == FIXED, FREE, camera.states), FIXED)
+    return replace(camera, states=states.astype(np.int8))
+
+
+def _say(notes: list[str], network: Network, which: NDArray[np.bool_], text: str) -> None:
+    at = np.flatnonzero(which)
+    if len(at):
+        names = ", ".join(network.points.labels[i] for i in at[:10]) + (", ..." if len(at) > 10 else "")
+        notes.append(f"{len(at)} point(s) {text}: {names}")
+
+
+def active_groups(network: Network, active: NDArray[np.bool_]) -> list[Kind]:
+    """Return the observation groups without rows of points set aside, and the direct observations."""
+    groups: list[Kind] = []
+    for group in network.observations:
+        keep = np.all([active[end] for end in group.points_of()], axis=0)
+        chosen = group if keep.all() else group.selected(keep)
+        if len(chosen):
+            groups.append(chosen)
+    groups.extend(direct_observations(network, active))
+    return groups
+
+
+def choose_datum(defect: Defect, lin: Linearization, settings: Settings, network: Network) -> Datum:
+    """Tie down the free transformations as the settings say.
+
+    Raises
+    ------
+    DatumDefect
+        If control is asked to define the datum and leaves freedoms.
+    """
+    none = np.zeros(0, dtype=np.intp)
+    unknowns: Unknowns = lin.unknowns
+    if not defect.count:
+        return Datum("control", defect, none, None, "The datum is defined by the observations and known values (defect 0).")
+    free = ", ".join(defect.free) if len(defect.free) == defect.count else f"{defect.count} combination(s) of shifts, rotations and scale"
+    if settings.datum == "control":
+        raise DatumDefect(
+            f"the known values do not define the datum: free are {free} (datum defect {defect.count}); "
+            "add control, or choose inner or minimal constraints (--datum inner)"
+        )
+    eliminated = eliminated_points(lin, none)
+    inner_points = np.zeros(unknowns.count, dtype=bool)
+    columns = unknowns["point"].columns.reshape(-1, 3)
+    inner_points[columns[eliminated].ravel()] = True
+    images = unknowns["image"].columns
+    held = none
+    for candidates in (images[images >= 0], np.flatnonzero(~inner_points), np.arange(unknowns.count)):
+        if len(candidates) >= defect.count and not len(held):
+            held = minimal_columns(defect, lin, candidates)
+    if len(held) < defect.count:
+        raise DatumDefect(f"the datum defect {defect.count} ({free}) cannot be removed by holding unknowns")
+    if settings.datum == "minimal":
+        names = ", ".join(unknowns.names[i] for i in held)
+        return Datum("minimal", defect, held, None, f"Minimal constraints hold {defect.count} unknown(s) at their start values: {names}.")
+    on = np.zeros(unknowns.count)
+    on[columns[columns >= 0]] = 1.0
+    where = "all object points"
+    conditions = defect.basis * on[:, None]
+    if np.linalg.matrix_rank(conditions) < defect.count:
+        on[images[images >= 0]] = 1.0
+        where, conditions = "all object points and images", defect.basis * on[:, None]
+    text = f"Free network: {defect.count} inner constraint(s) over {where} tie down {free}."
+    return Datum("inner", defect, held, conditions, text)
+
+
+def _iterate(
+    network: Network,
+    state: State,
+    lin: Linearization,
+    groups: list[Kind],
+    datum: Datum,
+    factor: Callable[..., Solver],
+    settings: Settings,
+) -> tuple[State, Linearization, list[Iteration], bool]:
+    """Damped Gauss-Newton: full steps while they help, Levenberg's damping when one does not."""
+    objective = float(lin.misclosure @ lin.misclosure)
+    floor = lin.count * 1e-8  # residuals of 1e-4 sigma count as none
+    history = [Iteration(0, objective, None, 0.0, True)]
+    damping, last = 0.0, np.inf
+    for count in range(1, settings.iterations + 1):
+        rhs = lin.design.T @ lin.misclosure
+        step = datum.transform(factor(lin, datum, damping).solve(rhs))
+        change = lin.design @ step
+        predicted = 2.0 * float(step @ rhs) - float(change @ change)
+        relative = float(np.linalg.norm(change) / np.sqrt(max(objective, floor)))
+        trial = state.moved(lin.unknowns, step)
+        misclosure = whitened_misclosures(network, trial, groups)
+        value = float(misclosure @ misclosure) if np.isfinite(misclosure).all() else np.inf
+        gain = (objective - value) / predicted if predicted > 0.0 else 0.0
+        at_rounding = relative < 1e-6 and abs(value - objective) <= 1e-9 * max(objective, floor)
+        accepted = bool(gain > 1e-4 or at_rounding)
+        history.append(Iteration(count, value if accepted else objective, relative, damping, accepted))
+        if settings.progress is not None:
+            settings.progress(history[-1])
+        if accepted:
+            state, objective = trial, value
+            lin = linearize(network, state, lin.unknowns, groups)
+            small_enough = relative <= settings.tolerance and damping == 0.0
+            if small_enough or (relative <= 1e-7 and relative >= 0.5 * last and damping == 0.0):
+                return state, lin, history, True
+            last = relative
+            damping = 0.0 if damping <= 1e-7 or at_rounding else damping * (0.1 if gain > 0.25 else 1.0)
+        else:
+            damping = max(10.0 * damping, 1e-5)
+            last = np.inf
+    return state, lin, history, False

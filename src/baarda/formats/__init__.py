@@ -1,0 +1,107 @@
+"""Reading and writing blocks: one file per format, recognised by content."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+from baarda.discover import members
+from baarda.errors import InputError, UsageError
+from baarda.formats.base import Format
+from baarda.network import Network
+
+__all__ = ["Format", "formats", "read", "recognise", "write"]
+
+
+def formats() -> dict[str, Format]:
+    """Return all file formats by name."""
+    return {f.name: f for f in members("baarda.formats", Format) if isinstance(f, Format)}
+
+
+def recognise(path: Path) -> Format:
+    """Return the format of a file or folder, judged by content.
+
+    Raises
+    ------
+    InputError
+        If the path does not exist, or no format or several know it.
+    """
+    if not path.exists():
+        raise InputError("no such file or folder", path)
+    if path.is_file() and path.stat().st_size == 0:
+        raise InputError("the file is empty", path)
+    found = [f for f in formats().values() if f.recognises(path)]
+    if not found:
+        raise InputError(f"no known format recognises it; known are {', '.join(formats())} (choose with --format)", path)
+    if len(found) > 1:
+        raise InputError(f"several formats recognise it ({', '.join(f.name for f in found)}); choose with --format", path)
+    return found[0]
+
+
+def read(path: str | Path, format: str | None = None, control: str | Path | None = None) -> Network:
+    """Read a network.
+
+    Parameters
+    ----------
+    path : str or Path
+        File or folder of any known format.
+    format : str, optional
+        Name of the format; by default it is recognised by content.
+    control : str or Path, optional
+        A table of control and check points that replaces what the source says of them, see `baarda.formats.control`.
+
+    Returns
+    -------
+    Network
+
+    Raises
+    ------
+    InputError
+        If a file cannot be used; the message names file and line.
+    """
+    where = Path(path)
+    if format is None:
+        chosen = recognise(where)
+    elif format in formats():
+        chosen = formats()[format]
+        if not where.exists():
+            raise InputError("no such file or folder", where)
+    else:
+        raise UsageError(f"unknown format {format!r}; known are {', '.join(formats())}")
+    network = replace(chosen.read(where), path=str(path), format=chosen.name, sha256=digest(where))
+    if control is not None:
+        from baarda.formats.control import with_control
+
+        network = with_control(network, Path(control))
+    return network
+
+
+def digest(path: Path) -> str:
+    """Return the sha256 of a file, or over the sorted relative names, sizes and contents of a folder."""
+    total = hashlib.sha256()
+    if path.is_file():
+        with path.open("rb") as f:
+            return hashlib.file_digest(f, "sha256").hexdigest()
+    for file in sorted(p for p in path.rglob("*") if p.is_file()):
+        name = file.relative_to(path).as_posix().encode()
+        total.update(len(name).to_bytes(8, "little") + name + file.stat().st_size.to_bytes(8, "little"))
+        with file.open("rb") as f:
+            while piece := f.read(1 << 20):
+                total.update(piece)
+    return total.hexdigest()
+
+
+def write(network: Network, path: str | Path, format: str) -> None:
+    """Write a network in a format that can be written.
+
+    Raises
+    ------
+    UsageError
+        If the format is unknown or cannot be written.
+    """
+    chosen = formats().get(format)
+    if chosen is None or chosen.write is None:
+        able = ", ".join(f.name for f in formats().values() if f.write is not None)
+        raise UsageError(f"format {format!r} cannot be written; these can: {able}")
+    chosen.write(network, Path(path))

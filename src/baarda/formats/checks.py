@@ -1,0 +1,197 @@
+"""Checks that readers share: what no adjustment could use is refused while file and line are still known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from baarda.errors import InputError
+from baarda.network import TIE, Points
+from baarda.observations import Distances
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+#: unit of object coordinates of sources that have neither unit nor datum (structure from motion)
+MODEL_UNITS = "model units"
+_METRES = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "in": 0.0254, "ft": 0.3048, "m": 1.0, "km": 1e3}
+
+# row -> error with file and line of that row
+Complaint = Callable[[int, str], InputError]
+
+
+def measured_once(images: Ints, points: Ints, labels: Sequence[str], error: Complaint, line: Callable[[int], int]) -> None:
+    """Refuse a point that is measured twice in one image.
+
+    Parameters
+    ----------
+    images, points : (n,) int arrays
+        Image and object point of each row.
+    labels : sequence of str
+        Labels of the object points.
+    error, line : callable
+        Row to error and to line number.
+
+    Raises
+    ------
+    InputError
+        That names both lines.
+    """
+    key = images * (int(points.max(initial=0)) + 1) + points
+    order = np.argsort(key, kind="stable")
+    again = np.flatnonzero(np.diff(key[order]) == 0)
+    if len(again):
+        at = again[np.argmin(order[again + 1])]
+        first, second = int(order[at]), int(order[at + 1])
+        raise error(second, f"point {labels[points[second]]!r} is measured twice in this image (first in line {line(first)})")
+
+
+def images_with_points(images: Ints, labels: Sequence[str], needed: NDArray[np.bool_], error: Complaint) -> None:
+    """Refuse images without image points.
+
+    Parameters
+    ----------
+    images : (n,) int array
+        Image of each measured point.
+    labels : sequence of str
+        Labels of all images.
+    needed : (images,) bool array
+        Which images have unknowns that image points must determine.
+    error : callable
+        Image to error.
+
+    Raises
+    ------
+    InputError
+        That names the first such image.
+    """
+    count = np.bincount(images, minlength=len(labels))
+    blind = np.flatnonzero((count == 0) & needed)
+    if len(blind):
+        raise error(int(blind[0]), f"image {labels[blind[0]]!r} has no image points")
+
+
+def rotation_matrices(matrices: Floats, error: Complaint) -> None:
+    """Refuse matrices that are not proper rotations within 1e-6; NaN = missing is left alone.
+
+    Parameters
+    ----------
+    matrices : (n, 3, 3) array
+    error : callable
+        Row to error.
+    """
+    misfit = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    improper = np.einsum("ni,ni->n", np.cross(matrices[:, 0], matrices[:, 1]), matrices[:, 2]) < 0.0
+    bad = np.flatnonzero((misfit > 1e-6) | improper)
+    if len(bad):
+        raise error(int(bad[0]), "the matrix is not a rotation (orthonormal with determinant +1)")
+
+
+def correlations(values: Floats, error: Complaint) -> None:
+    """Refuse correlations of three coordinates that no covariance matrix can have.
+
+    Parameters
+    ----------
+    values : (n, 3) array
+        Correlations XY, XZ, YZ.
+    error : callable
+        Row to error.
+    """
+    xy, xz, yz = values.T
+    determinant = 1.0 + 2.0 * xy * xz * yz - xy**2 - xz**2 - yz**2
+    bad = np.flatnonzero((np.abs(values) >= 1.0).any(axis=1) | ~(determinant > 0.0))
+    if len(bad):
+        raise error(int(bad[0]), "the correlations are not those of a covariance matrix (positive definite)")
+
+
+def guessed_unit(unit: str, factor: float) -> str:
+    """Return the unit whose numbers are `factor` times those in `unit`, empty when none fits within a third.
+
+    Examples
+    --------
+    >>> guessed_unit("m", 1040.0), guessed_unit("mm", 1e-3), guessed_unit("m", 57.0)
+    ('mm', 'm', '')
+    """
+    if unit not in _METRES:
+        return ""
+    misfit = {name: abs(math.log(factor * metres / _METRES[unit])) for name, metres in _METRES.items() if name != unit}
+    best = min(misfit, key=misfit.__getitem__)
+    return best if misfit[best] < math.log(4.0 / 3.0) else ""
+
+
+def _size(xyz: Floats) -> float:
+    """Return the size of a cloud of points that a few gross errors do not change."""
+    return float(np.median(np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1))) if len(xyz) > 1 else 0.0
+
+
+def control_unit(points: Points, unit: str, error: Complaint, position: Floats | None = None) -> None:
+    """Refuse control whose size contradicts the start values by a factor that only a wrong unit explains.
+
+    Compared are the control and check points with their own start values (limit 50); where these tell nothing, with the start values of
+    the other points (limit 200), where there are none, with the distances of the cameras (limit 200).
+
+    Parameters
+    ----------
+    points : Points
+    unit : str
+        Unit of the start values.
+    error : callable
+        Index of a point to error.
+    position : (images, 3) array, optional
+        Start values of the projection centres.
+
+    Raises
+    ------
+    InputError
+        That suggests the unit.
+    """
+    known = np.flatnonzero(np.isfinite(points.given).all(axis=1) & (points.roles != TIE))
+    if len(known) < 2:
+        return
+    control = points.given[known]
+    both = known[np.isfinite(points.coordinates[known]).all(axis=1)]
+    own, start = _size(points.given[both]), _size(points.coordinates[both])
+    if own > 0.0 and start > 0.0 and not 1 / 50 < own / start < 50:
+        raise error(int(both[0]), _wrong_unit(own, start, "start values of the same points", unit))
+    ties = points.coordinates[np.isfinite(points.coordinates).all(axis=1) & (points.roles == TIE)]
+    size = _size(control)
+    if len(ties) > 2 and size > 0.0 and _size(ties) > 0.0:
+        if not 1 / 200 < size / _size(ties) < 200:
+            raise error(int(known[0]), _wrong_unit(size, _size(ties), "start values of the other points", unit))
+    elif position is not None:
+        position = position[np.isfinite(position).all(axis=1)]
+        if len(position) and size > 0.0:
+            away = float(np.median(np.linalg.norm(position - np.median(control, axis=0), axis=1)))
+            if away > 0.0 and not 1 / 200 < size / away < 200:
+                raise error(int(known[0]), _wrong_unit(size, away, "start values of the cameras, away from the control,", unit))
+
+
+def _wrong_unit(size: float, other: float, whose: str, unit: str) -> str:
+    guess = guessed_unit(unit, size / other)
+    hint = f"; are the control coordinates in {guess} and not in {unit}?" if guess else "; check the unit of the control coordinates"
+    return f"the control and check points spread over {size:.4g}, the {whose} over {other:.4g}: not the same unit{hint}"
+
+
+def distance_unit(group: Distances, points: Points, unit: str, error: Complaint) -> None:
+    """Refuse distances of which at least half are 50 times longer, or shorter, than between the start values of their ends.
+
+    Parameters
+    ----------
+    group : Distances
+    points : Points
+    unit : str
+    error : callable
+        Row to error.
+    """
+    apart = np.linalg.norm(points.coordinates[group.ends] - points.coordinates[group.starts], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = group.values / apart
+    usable = ratio[np.isfinite(ratio)]
+    if len(usable) and not 1 / 50 < np.median(usable) < 50:
+        i = int(np.flatnonzero(np.isfinite(ratio) & ((ratio >= 50.0) | (ratio <= 1 / 50)))[0])
+        guess = guessed_unit(unit, float(ratio[i]))
+        hint = f"; is it in {guess} and not in {unit}?" if guess else "; check its unit"
+        raise error(i, f"the distance is {group.values[i]!r}, the start values of its ends are {apart[i]:.6g} apart{hint}")

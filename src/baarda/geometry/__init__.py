@@ -1,0 +1,1 @@
+"""Formulas of imaging geometry with their partial derivatives: pure functions on arrays."""

@@ -1,0 +1,22 @@
+"""The network: who was measured, from where, with what, and what is known beforehand."""
+
+from baarda.network.network import AXES, CHECK, CONTROL, EXTERIOR, ROLES, TIE, Images, Network, Points
+from baarda.network.parameters import State, UnknownGroup, Unknowns, unknowns_of
+from baarda.network.tables import Table
+
+__all__ = [
+    "AXES",
+    "CHECK",
+    "CONTROL",
+    "EXTERIOR",
+    "ROLES",
+    "TIE",
+    "Images",
+    "Network",
+    "Points",
+    "State",
+    "Table",
+    "UnknownGroup",
+    "Unknowns",
+    "unknowns_of",
+]

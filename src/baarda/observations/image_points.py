@@ -1,0 +1,190 @@
+"""Image points: measured image coordinates and the collinearity equations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from baarda.cameras import Optics
+from baarda.errors import UsageError
+from baarda.geometry import collinearity
+from baarda.network import Network, State
+from baarda.observations.base import Block, Floats, Ints, Rows
+
+CHUNK = 16384
+
+
+@dataclass(frozen=True)
+class ImagePoints:
+    """Measured image coordinates.
+
+    Attributes
+    ----------
+    images, points : (n,) int arrays
+        Indices of image and object point.
+    xy : (n, 2) array
+        Measured coordinates, source pixels.
+    sigmas : (n, 2) array
+        A-priori standard deviations, source pixels.
+    correlations : (n,) array
+        Correlation of x and y.
+    name : str
+    residual_plane : {"image", "corrected"}
+        Where residuals live: in the image as measured, or in the plane where a `correct` model meets the collinearity equations (what
+        DBAT does); either way they are stated in source pixels and axes.
+
+    Notes
+    -----
+    In the image plane v = distort(projected) - measured: the exact solution of the combined model B v + A x = l of a `correct` model, with
+    the residuals of the original observations. In the corrected plane v = projected - correct(measured), divided by the pixel size.
+    """
+
+    images: Ints
+    points: Ints
+    xy: Floats
+    sigmas: Floats
+    correlations: Floats
+    name: str = "image points"
+    residual_plane: Literal["image", "corrected"] = "image"
+
+    def __post_init__(self) -> None:
+        for key in ("images", "points", "xy", "sigmas", "correlations"):
+            view = np.asarray(getattr(self, key)).view()
+            view.flags.writeable = False
+            object.__setattr__(self, key, view)
+        if self.residual_plane not in ("image", "corrected"):
+            raise UsageError(f"residual_plane must be 'image' or 'corrected', not {self.residual_plane!r}")
+
+    @staticmethod
+    def make(images: Any, points: Any, xy: Any, sigmas: Any = 1.0, correlations: Any = None, **rest: Any) -> ImagePoints:
+        """Make image points; `sigmas` may be one number for all."""
+        n = len(images)
+        return ImagePoints(
+            np.asarray(images, dtype=np.intp),
+            np.asarray(points, dtype=np.intp),
+            np.asarray(xy, dtype=float).reshape(n, 2),
+            np.broadcast_to(np.asarray(sigmas, dtype=float), (n, 2)).copy(),
+            np.zeros(n) if correlations is None else np.asarray(correlations, dtype=float),
+            **rest,
+        )
+
+    components = ("x", "y")
+    unit = "px"
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def selected(self, keep: Any) -> ImagePoints:
+        """Return some of the image points (index or mask)."""
+        return replace(
+            self,
+            images=self.images[keep],
+            points=self.points[keep],
+            xy=self.xy[keep],
+            sigmas=self.sigmas[keep],
+            correlations=self.correlations[keep],
+        )
+
+    def points_of(self) -> tuple[Ints, ...]:
+        """Return the object point of each row."""
+        return (self.points,)
+
+    def observed(self) -> Floats:
+        """Return the measured coordinates."""
+        return self.xy
+
+    def sigma(self) -> Floats:
+        """Return the a-priori standard deviations."""
+        return self.sigmas
+
+    def labels(self, network: Network) -> dict[str, Any]:
+        """Return image and point codes."""
+        return {"image": self.images, "point": self.points}
+
+    def _chunks(self, network: Network) -> list[tuple[Optics, Ints, int]]:
+        """Split the rows by optics (model and constants), then into chunks of fixed size."""
+        optics: dict[tuple[Any, ...], tuple[Optics, list[int]]] = {}
+        for i, c in enumerate(network.cameras):
+            key = (c.model.name, *np.ravel(c.pixel_size), *np.ravel(c.origin), c.y_down)
+            optics.setdefault(key, (Optics.of(c), []))[1].append(i)
+        camera = network.images.cameras[self.images]
+        out = []
+        for o, members in optics.values():
+            rows = np.flatnonzero(np.isin(camera, members)) if len(optics) > 1 else np.arange(len(self))
+            out += [(o, rows[a : a + CHUNK], len(o.model.order)) for a in range(0, len(rows), CHUNK)]
+        return out
+
+    def _computed(self, optics: Optics, rows: Ints, network: Network, state: State) -> tuple[Any, ...]:
+        image = self.images[rows]
+        camera = network.images.cameras[image]
+        same = camera.min() == camera.max() if len(camera) else True
+        p = state.cameras[camera[0]][None] if same else np.stack(state.cameras)[camera] if _equal(state) else _gather(state, camera)
+        rotation = state.rotation[image]
+        vectors = collinearity.camera_coordinates(rotation, state.position[image], state.points[self.points[rows]])
+        ideal, d_vectors, in_front = collinearity.project(vectors)
+        return p, camera, image, rotation, vectors, ideal, d_vectors, in_front
+
+    def linearize(self, network: Network, state: State) -> list[Rows]:
+        """Linearise all rows in chunks; see `Kind.linearize`."""
+        out = []
+        for optics, rows, _ in self._chunks(network):
+            p, camera, image, rotation, vectors, ideal, d_vectors, _front = self._computed(optics, rows, network, state)
+            measured = self.xy[rows]
+            if self.residual_plane == "image":
+                computed, d_ideal, d_camera, _ = optics.distort(ideal, p, start=measured)
+                misclosure = measured - computed
+            else:
+                projected, d_ideal, p_camera = optics.from_ideal(ideal, p)
+                corrected, _, m_camera = optics.from_measured(measured, p)
+                factor = _to_pixels(optics)
+                misclosure = (corrected - projected) * factor
+                d_ideal, d_camera = d_ideal * factor[:, None], (p_camera - m_camera) * factor[:, None]
+            d_exterior, d_point = collinearity.partials(rotation, vectors, d_ideal @ d_vectors)
+            blocks = (Block("camera", camera, d_camera), Block("image", image, d_exterior), Block("point", self.points[rows], d_point))
+            out.append(Rows(rows, misclosure, blocks, self._cofactor(rows)))
+        return out
+
+    def misclosures(self, network: Network, state: State) -> Floats:
+        """Return observed - computed, (n, 2)."""
+        out = np.empty((len(self), 2))
+        for optics, rows, _ in self._chunks(network):
+            p, *_, ideal, _d, _front = self._computed(optics, rows, network, state)
+            measured = self.xy[rows]
+            if self.residual_plane == "image":
+                out[rows] = measured - optics.distort(ideal, p, start=measured)[0]
+            else:
+                out[rows] = (optics.from_measured(measured, p)[0] - optics.from_ideal(ideal, p)[0]) * _to_pixels(optics)
+        return out
+
+    def in_front(self, network: Network, state: State) -> NDArray[np.bool_]:
+        """Return for each row whether its point lies in front of its camera."""
+        out = np.empty(len(self), dtype=bool)
+        for optics, rows, _ in self._chunks(network):
+            out[rows] = self._computed(optics, rows, network, state)[-1]
+        return out
+
+    def _cofactor(self, rows: Ints) -> Floats:
+        s = self.sigmas[rows]
+        q = np.zeros((len(rows), 2, 2))
+        q[:, 0, 0], q[:, 1, 1] = s[:, 0] ** 2, s[:, 1] ** 2
+        q[:, 0, 1] = q[:, 1, 0] = self.correlations[rows] * s[:, 0] * s[:, 1]
+        return q
+
+
+def _to_pixels(optics: Optics) -> Floats:
+    """Return the factors from the meeting plane to source pixels and axes."""
+    turned = optics.y_down and any(s.name == "flip" for s in optics.model.measured)
+    return np.array([1.0, -1.0 if turned else 1.0]) / optics.pixel_size
+
+
+def _equal(state: State) -> bool:
+    return len({len(c) for c in state.cameras}) == 1
+
+
+def _gather(state: State, camera: Ints) -> Floats:
+    """Stack the parameters of cameras of one model among cameras of several."""
+    used, inverse = np.unique(camera, return_inverse=True)
+    return np.asarray(np.stack([state.cameras[i] for i in used])[inverse])

@@ -1,0 +1,236 @@
+"""The report: sections of an analysis, laid out as text or as one self-contained page."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from importlib import resources
+from typing import Any
+
+from baarda.discover import members
+from baarda.procedures.testing import Analysis
+from baarda.report import plots
+from baarda.report.sections.base import (
+    WORDS,
+    Block,
+    Cell,
+    DataTable,
+    Figure,
+    Items,
+    Paragraph,
+    Section,
+    SectionMaker,
+    Verdict,
+)
+from baarda.report.sections.verdict import sentences
+
+__all__ = ["figures", "html", "sections", "text", "verdict"]
+
+_WIDTH = 100
+
+
+def sections(analysis: Analysis) -> list[Section]:
+    """Return the sections of the report that apply, in order.
+
+    Parameters
+    ----------
+    analysis : Analysis
+
+    Returns
+    -------
+    list of Section
+    """
+    makers = [m for m in members("baarda.report.sections", SectionMaker) if isinstance(m, SectionMaker)]
+    made = (m.make(analysis) for m in sorted(makers, key=lambda m: (m.order, m.id)))
+    return [s for s in made if s is not None]
+
+
+def verdict(analysis: Analysis) -> list[str]:
+    """Return the outcome in five to eight plain sentences; a single one if the adjustment did not converge.
+
+    Parameters
+    ----------
+    analysis : Analysis
+
+    Returns
+    -------
+    list of str
+    """
+    return [s.text for s in sentences(analysis)]
+
+
+def figures(made: list[Section]) -> dict[str, str]:
+    """Return the figures of sections as SVG documents by file name without extension.
+
+    Parameters
+    ----------
+    made : list of Section
+
+    Returns
+    -------
+    dict of str
+    """
+    return {b.name: f'<?xml version="1.0" encoding="utf-8"?>\n{_labelled(b)}' for s in made for b in s.blocks if isinstance(b, Figure)}
+
+
+def _labelled(figure: Figure) -> str:
+    """Return the SVG with title and description for those who do not see it."""
+    from html import escape
+
+    said = f"<title>{escape(figure.title)}</title>\n<desc>{escape(figure.alt)}</desc>"
+    head, rest = figure.svg.split(">", 1)
+    return f'{head} role="img" aria-label="{escape(figure.alt)}">\n {said}{rest}'
+
+
+def text(made: list[Section]) -> str:
+    """Return sections as plain text.
+
+    Parameters
+    ----------
+    made : list of Section
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> print(text([Section("a", "First", (Paragraph("One word."),))]), end="")
+    1 First
+    =======
+    <BLANKLINE>
+    One word.
+    """
+    lines: list[str] = []
+    for number, section in enumerate(made, start=1):
+        head = f"{number} {section.title}"
+        lines += [*([""] if lines else []), head, "=" * len(head)]
+        for block in section.blocks:
+            lines += ["", *_text(block)]
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def _text(block: Block) -> list[str]:
+    if isinstance(block, Paragraph):
+        return textwrap.wrap(block.text, _WIDTH)
+    if isinstance(block, Items):
+        wrapped = [textwrap.wrap(e, _WIDTH, initial_indent="- ", subsequent_indent="  ") for e in block.entries]
+        return [block.intro, *(line for lines in wrapped for line in lines)]
+    if isinstance(block, Verdict):
+        out: list[str] = []
+        for s in block.sentences:
+            head = f"[{WORDS[s.tone]}] "
+            out += textwrap.wrap(head + s.text, _WIDTH, subsequent_indent="    ")
+        return out
+    if isinstance(block, Figure):
+        return textwrap.wrap(f"[Figure {block.name}: {block.title}. {block.alt}]", _WIDTH)
+    return _text_table(block)
+
+
+def _plain(cell: str | Cell) -> str:
+    return " ".join((cell.text if isinstance(cell, Cell) else cell).split("\n"))
+
+
+def _text_table(table: DataTable) -> list[str]:
+    heads = [[c.name for c in table.columns], [f"({c.unit})" if c.unit else "" for c in table.columns]]
+    body = [[_plain(c) for c in row] for row in table.rows]
+    most = 44
+    grid: list[list[str]] = [h for h in heads if any(h)]
+    rule = len(grid)
+    for row in body:
+        cells = [textwrap.wrap(c, most, subsequent_indent="  ") if len(c) > most else [c] for c in row]
+        for i in range(max(len(c) for c in cells)):
+            grid.append([c[i] if i < len(c) else "" for c in cells])
+    widths = [max(len(row[k]) for row in grid) for k in range(len(table.columns))] if grid else []
+    right = [c.align == "right" for c in table.columns]
+    lines = ["  ".join(v.rjust(w) if r else v.ljust(w) for v, w, r in zip(row, widths, right, strict=True)) for row in grid]
+    lines.insert(rule, "-" * (sum(widths) + 2 * max(0, len(widths) - 1)))
+    meanings = [f"{names}: {meaning}" for names, meaning in glossary(table)]
+    notes = [w for t in ("; ".join(meanings), table.note) if t for w in textwrap.wrap(t, _WIDTH)]
+    return [table.caption, "", *lines, *([""] if notes else []), *notes]
+
+
+def glossary(table: DataTable) -> list[tuple[str, str]]:
+    """Return what the columns of a table mean: names and meaning, names that mean the same together."""
+    out: dict[str, list[str]] = {}
+    for c in table.columns:
+        if c.meaning:
+            out.setdefault(c.meaning, []).append(c.name)
+    return [(", ".join(named), meaning) for meaning, named in out.items()]
+
+
+def html(analysis: Analysis, made: list[Section]) -> str:
+    """Return sections as one page: no scripts, nothing loaded from anywhere, readable offline.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        For the head of the page.
+    made : list of Section
+        See `sections`.
+
+    Returns
+    -------
+    str
+    """
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
+
+    folder = resources.files("baarda.report") / "texts"
+
+    def load(name: str) -> str:
+        return (folder / name).read_text(encoding="utf-8")
+
+    environment = Environment(autoescape=True, loader=FunctionLoader(load), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.tests["cell"] = lambda value: isinstance(value, Cell)
+    net = analysis.adjustment.network
+    context: dict[str, Any] = {
+        "name": net.name or net.path or "network in memory",
+        "status": analysis.adjustment.status,
+        "sections": [(n, s, [(type(b).__name__.lower(), b) for b in s.blocks]) for n, s in enumerate(made, start=1)],
+        "words": WORDS,
+        "inline": _inline,
+        "glossary": glossary,
+        "facts": _facts(analysis),
+        "overall": _overall(analysis),
+    }
+    return environment.get_template("report.html.j2").render(context)
+
+
+def _overall(analysis: Analysis) -> tuple[str, str]:
+    """Return tone and words of the whole: the gravest sentence decides."""
+    if not analysis.converged:
+        return "bad", "Not converged: no result"
+    tones = [s.tone for s in sentences(analysis)]
+    bad, warn = tones.count("bad"), tones.count("warn")
+    needs = "needs attention" if warn == 1 else "need attention"
+    if bad:
+        return "bad", f"{bad} of {len(tones)} statements failed a test" + (f", {warn} {needs}" if warn else "")
+    if warn:
+        return "warn", f"No test failed; {warn} of {len(tones)} statements {needs}"
+    return "good", "No test failed"
+
+
+def _facts(analysis: Analysis) -> list[tuple[str, str]]:
+    a = analysis.adjustment
+    net = a.network
+    facts = [("images", str(len(net.images.labels))), ("points", str(int((~a.aside).sum()))), ("observations n", str(a.count))]
+    facts += [("unknowns u", str(a.numbering.count)), ("redundancy r", str(a.redundancy))]
+    return [*facts, ("s0", f"{a.sigma0:.3f}")] if analysis.converged else facts
+
+
+def _inline(figure: Figure) -> Any:
+    """Return the SVG for a page: colours follow the page, no namespaces (an HTML parser knows them)."""
+    from markupsafe import Markup
+
+    svg = re.sub(r' xmlns(:xlink)?="[^"]*"', "", figure.svg, count=2)
+    svg = re.sub(r"<defs>\s*<style type=\"text/css\">[^<]*</style>\s*</defs>\s*", "", svg, count=1)
+    for colour, variable in ((plots.INK, "ink"), (plots.MUTED, "muted"), (plots.LINE, "line")):
+        svg = svg.replace(f": {colour}", f": var(--{variable})")
+    head, rest = svg.split(">", 1)
+    head = re.sub(r' (width|height)="[^"]*"', "", head)
+    width = re.search(r'viewBox="0 0 ([\d.]+)', head)
+    style = f'style="width: {float(width[1]) / 72 * 96:.0f}px"' if width else ""
+    # The drawing escapes its own text; the words around it are escaped here.
+    return Markup('{head} role="img" aria-label="{alt}" {style}>{rest}').format(
+        head=Markup(head), alt=figure.alt, style=Markup(style), rest=Markup(rest)
+    )  # fmt: skip

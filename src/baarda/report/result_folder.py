@@ -1,0 +1,345 @@
+"""The result folder: report, JSON, tables, figures and the adjusted project; there whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+import platform
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import baarda
+from baarda.adjustment import Adjustment
+from baarda.errors import MissingExtra, OutputError
+from baarda.formats.project import write as write_project
+from baarda.hypotheses.base import TestResult
+from baarda.network import Table
+from baarda.observations import Direct, ImagePoints
+from baarda.procedures.testing import Analysis
+
+SCHEMA = "baarda.result/1"
+
+
+def plain(value: Any) -> Any:
+    """Return a JSON-compatible value: NumPy numbers as Python ones, NaN and infinity as None."""
+    if isinstance(value, np.ndarray):
+        return [plain(v) for v in value.tolist()]
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def result_json(analysis: Analysis) -> dict[str, Any]:
+    """Return the content of `result.json` (contract, section 2)."""
+    a, o = analysis.adjustment, analysis.options
+    net = a.network
+    roles = net.points.roles[~a.aside]
+    used = o.sigma if analysis.converged else "apriori"
+    table = a.unknown_table(o.sigma)
+    camera = [row for row in table.rows() if row["group"] == "camera"]
+    fixed = [
+        {
+            "name": f"camera {c.label}: {n}",
+            "group": "camera",
+            "unit": c.unit_of(k),
+            "value": v,
+            "sigma": None,
+            "initial": v,
+            "state": "fixed",
+        }
+        for c in net.cameras
+        for k, (n, v) in enumerate(zip(c.model.order, c.values, strict=True))
+        if c.states[k] == 0
+    ]
+    image_rows = [isinstance(g, ImagePoints) for g in a.groups]
+    document = {
+        "schema": SCHEMA,
+        "source": {"path": net.path, "format": net.format, "sha256": net.sha256},
+        "status": a.status,
+        "counts": {
+            "images": len(net.images.labels),
+            "cameras": len(net.cameras),
+            "object_points": len(roles),
+            "control_points": int((roles == 1).sum()),
+            "check_points": int((roles == 2).sum()),
+            "observations": a.count,
+            "image_observations": sum(2 * len(g) for g, used in zip(a.groups, image_rows, strict=True) if used),
+            "unknowns": a.numbering.count,
+            "datum_defect": a.datum.defect.count,
+            "datum_conditions": a.datum.defect.count,
+            "redundancy": a.redundancy,
+        },
+        "objective": {"initial": a.history[0].objective, "final": a.objective},
+        "sigma0": {"apriori": 1.0, "aposteriori": a.sigma0, "used": used},
+        "iterations": len(a.history) - 1,
+        "history": [
+            {"iteration": h.count, "objective": h.objective, "relative_step": h.relative_step, "damping": h.damping, "accepted": h.accepted}
+            for h in a.history
+        ],
+        "datum": {"name": a.datum.name, "text": a.datum.text},
+        "assumptions": list(a.assumptions),
+        "points_set_aside": [net.points.labels[i] for i in np.flatnonzero(a.aside)],
+        "unknowns": camera + fixed,
+        "correlations": _correlations(a) if analysis.converged else [],
+        "tests": [_test(t) for t in analysis.tests],
+        "laws": [f.as_dict() for f in analysis.laws],
+        "outliers": _outliers(analysis) if analysis.converged else [],
+        "selection": [],
+        "check_points": _check_points(analysis) if analysis.converged else [],
+        "rms": _rms(a),
+        "software": {
+            "name": "baarda",
+            "version": baarda.__version__,
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "scipy": _scipy_version(),
+        },
+    }
+    return dict(plain(document))
+
+
+def _scipy_version() -> str:
+    import scipy
+
+    return str(scipy.__version__)
+
+
+def _test(t: TestResult) -> dict[str, Any]:
+    """One test; of a family the extreme member, the number beyond the limit and the number tested."""
+    out: dict[str, Any] = {"name": t.name, "null": t.null, "df": list(t.df), "law": t.law_name, "alpha": t.alpha, "critical": t.critical}
+    if np.ndim(t.statistic):
+        p, statistic = np.asarray(t.p_value), np.asarray(t.statistic)
+        tested = np.isfinite(p)
+        out |= {"tested": int(tested.sum()), "beyond": int(np.sum(t.rejected)), "rejected": bool(np.any(t.rejected))}
+        if tested.any():
+            i = int(np.lexsort((-np.abs(np.where(tested, statistic, 0.0)), np.where(tested, p, np.inf)))[0])
+            out |= {"statistic": statistic[i], "p_value": p[i], "labels": [t.labels[i]] if t.labels else []}
+        else:
+            out |= {"statistic": None, "p_value": None, "labels": []}
+    else:
+        out |= {"statistic": t.statistic, "p_value": t.p_value, "rejected": t.rejected}
+        if t.labels:
+            out["labels"] = list(t.labels)
+    if t.note:
+        out["note"] = t.note
+    return out
+
+
+def _correlations(a: Adjustment, limit: float = 0.95) -> list[dict[str, Any]]:
+    """Correlations of camera parameters, among themselves and with exterior unknowns, from `limit` on."""
+    names = a.numbering.names
+    e = a.camera_estimates
+    if not e.names:
+        return []
+    columns = np.array([a.numbering.column(n) for n in e.names])
+    image = a.numbering["image"].columns
+    image = image[image >= 0]
+    unit = np.zeros((a.numbering.count, len(columns)))
+    unit[columns, np.arange(len(columns))] = 1.0
+    q = a.cofactors.solve(unit)
+    others = np.concatenate([columns, image])
+    variances = np.empty(len(others))
+    variances[: len(columns)] = np.diag(e.cofactors)
+    blocks = a.cofactors.blocks(a.numbering["image"].columns.reshape(-1, 6))
+    kept = a.numbering["image"].columns.reshape(-1, 6) >= 0
+    variances[len(columns) :] = np.einsum("nii->ni", blocks)[kept]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        r = q[others] / np.sqrt(variances[:, None] * np.diag(e.cofactors)[None, :])
+    out = []
+    for j, name in enumerate(e.names):
+        for i in np.flatnonzero(np.abs(r[:, j]) >= limit):
+            if i > j:
+                out.append({"a": name, "b": names[others[i]], "value": r[i, j]})
+    return out
+
+
+def _outliers(analysis: Analysis) -> list[dict[str, Any]]:
+    o = analysis.observations
+    keys = ("group", "image", "point", "component", "residual", "redundancy", "w", "tau", "mdb", "estimated_error", "p_value")
+    return [{k: o[k][i] for k in keys} for i in analysis.suspected]
+
+
+def _check_points(analysis: Analysis) -> list[dict[str, Any]]:
+    e = analysis.evidence.check
+    if e is None:
+        return []
+    s = analysis.adjustment.scale("aposteriori") * np.sqrt(np.diag(e.cofactors))
+    family = {label: i for t in analysis.tests_named("check_point") for i, label in enumerate(t.labels)}
+    tests = analysis.tests_named("check_point")
+    rows: dict[str, dict[str, Any]] = {}
+    for name, point, d, sd in zip(e.names, e.groups, e.values, s, strict=True):
+        row = rows.setdefault(point, {"point": point, "dx": None, "dy": None, "dz": None, "sx": None, "sy": None, "sz": None})
+        axis = name[-1].lower()
+        row[f"d{axis}"], row[f"s{axis}"] = d, sd
+    for point, row in rows.items():
+        i = family.get(point, family.get(f"point {point}"))
+        if tests and i is not None:
+            t = tests[0]
+            row |= {
+                "statistic": np.asarray(t.statistic)[i],
+                "p_value": np.asarray(t.p_value)[i],
+                "rejected": bool(np.asarray(t.rejected)[i]),
+            }
+    return list(rows.values())
+
+
+def _rms(a: Adjustment) -> dict[str, Any]:
+    """Root mean squares: image residuals (px), control residuals and check differences (object units)."""
+    v = [a.residuals[a.offsets[g] : a.offsets[g + 1]].reshape(-1, 2) for g, k in enumerate(a.groups) if isinstance(k, ImagePoints)]
+    image = np.concatenate(v) if v else np.zeros((0, 2))
+    out: dict[str, Any] = {"image_x": _root(image[:, 0]), "image_y": _root(image[:, 1]), "control": {}, "check": {}}
+    for g, group in enumerate(a.groups):
+        if isinstance(group, Direct) and group.kind == "point":
+            values = a.residuals[a.offsets[g] : a.offsets[g + 1]]
+            out["control"] = {axis.lower(): _root(values[group.positions == k]) for k, axis in enumerate("XYZ")}
+    points = a.network.points
+    d = (points.coordinates - points.given)[(points.roles == 2) & ~a.aside]
+    if len(d):
+        by_axis = [_root(d[np.isfinite(d[:, k]), k]) for k in range(3)]
+        both, full = d[np.isfinite(d[:, :2]).all(axis=1)], d[np.isfinite(d).all(axis=1)]
+        out["check"] = {
+            "x": by_axis[0],
+            "y": by_axis[1],
+            "z": by_axis[2],
+            "vertical": by_axis[2],
+            "horizontal": _root(np.linalg.norm(both[:, :2], axis=1)),
+            "3d": _root(np.linalg.norm(full, axis=1)),
+        }
+    return out
+
+
+def _root(values: Any) -> float | None:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
+
+
+def table_csv(table: Table) -> str:
+    """Return a table as CSV; numbers read back exactly, not-a-number is empty."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(table.columns)
+    columns = [_cells(c) for c in table.columns.values()]
+    writer.writerows(zip(*columns, strict=True))
+    return out.getvalue()
+
+
+def _cells(column: np.ndarray[Any, Any]) -> list[str]:
+    if column.dtype.kind == "f":
+        return ["" if v != v or v in (math.inf, -math.inf) else repr(v) for v in column.tolist()]
+    return [str(v) for v in column.tolist()]
+
+
+@contextmanager
+def whole_folder(target: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside `target` and rename it there on success; on any failure nothing is left.
+
+    Raises
+    ------
+    OutputError
+        If the target is a file or a folder that this program did not write, or if writing fails.
+    """
+    if target.exists() and not (target.is_dir() and (not any(target.iterdir()) or (target / "result.json").is_file())):
+        raise OutputError(f"{target} exists and is not a result folder: choose another --out")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    except OSError as error:
+        raise OutputError(f"cannot write beside {target}: {error.strerror}") from None
+    try:
+        yield temporary
+        _permit(temporary)
+        old = target.with_name(f".{target.name}-old-{os.getpid()}")
+        if target.exists():
+            target.rename(old)
+        temporary.rename(target)
+        shutil.rmtree(old, ignore_errors=True)
+    except OSError as error:
+        raise OutputError(f"cannot write {target}: {error.strerror}") from None
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _permit(folder: Path) -> None:
+    """Give the folder the permissions that the user's mask allows (temporary folders are private)."""
+    mask = os.umask(0)
+    os.umask(mask)
+    folder.chmod(0o777 & ~mask)
+
+
+def write_folder(analysis: Analysis, out: str | Path, tables: str = "csv", run: dict[str, Any] | None = None) -> Path:
+    """Write the result folder.
+
+    Parameters
+    ----------
+    analysis : Analysis
+    out : str or Path
+        The folder; an earlier result folder there is replaced.
+    tables : {"csv", "parquet"}
+        Format of the tables.
+    run : dict, optional
+        What differs from run to run (timings), for `run.json`.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written; nothing is left behind.
+    """
+    from baarda.report import page
+
+    target = Path(out)
+    a, o = analysis.adjustment, analysis.options
+    content = {
+        "observations": analysis.observations if analysis.converged else a.observations,
+        "points": a.point_table(o.sigma),
+        "images": a.image_table(o.sigma),
+        "unknowns": a.unknown_table(o.sigma),
+    }
+    document = json.dumps(result_json(analysis), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    sections = page.sections(analysis)
+    html = page.html(analysis, sections)
+    with whole_folder(target) as folder:
+        _write(folder / "result.json", document)
+        _write(folder / "report.html", html)
+        (folder / "tables").mkdir()
+        for name, table in content.items():
+            if tables == "parquet":
+                _parquet(table, folder / "tables" / f"{name}.parquet")
+            else:
+                _write(folder / "tables" / f"{name}.csv", table_csv(table))
+        (folder / "figures").mkdir()
+        for name, svg in page.figures(sections).items():
+            _write(folder / "figures" / f"{name}.svg", svg)
+        write_project(a.network, folder / "project")
+        _write(folder / "run.json", json.dumps(plain(run or {}), indent=1, allow_nan=False) + "\n")
+    return target
+
+
+def _write(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8", newline="\n")
+
+
+def _parquet(table: Table, path: Path) -> None:
+    try:
+        from pyarrow import parquet  # type: ignore[import-untyped, import-not-found, unused-ignore]
+    except ImportError:
+        raise MissingExtra("tables", "--tables parquet") from None
+    parquet.write_table(table.to_arrow(), path)

@@ -1,0 +1,218 @@
+"""What several sections need of an analysis, derived once and told in one way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from baarda.cameras import FIXED
+from baarda.hypotheses.base import TestResult
+from baarda.network import AXES, CONTROL
+from baarda.observations import Direct, ImagePoints
+from baarda.procedures.testing import Analysis
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+MOST_ROWS = 200
+MOST_COLUMNS = 100  # camera parameters whose correlations are told one by one
+
+
+def result_of(analysis: Analysis, name: str) -> TestResult | None:
+    """Return the first test of this name."""
+    found = analysis.tests_named(name)
+    return found[0] if found else None
+
+
+def scaling(analysis: Analysis) -> str:
+    """Return which variance factor scales standard deviations, in words."""
+    return "a posteriori" if analysis.options.sigma == "aposteriori" else "a priori"
+
+
+def judge(analysis: Analysis) -> tuple[str, Floats, float]:
+    """Return the statistic that judges single observations (tau or w), its values and the limit of its size."""
+    name, values = ("tau", analysis.tau) if analysis.options.sigma == "aposteriori" else ("w", analysis.w)
+    test = result_of(analysis, "data_snooping")
+    critical = np.nan if test is None else float(np.max(np.abs(test.critical)))
+    return name, values, critical
+
+
+def image_rows(analysis: Analysis) -> NDArray[np.bool_]:
+    """Return which scalar observations are image coordinates."""
+    a = analysis.adjustment
+    return np.concatenate([np.full(len(g) * len(g.components), isinstance(g, ImagePoints)) for g in a.groups])
+
+
+def unit_of(analysis: Analysis, row: int) -> str:
+    """Return the unit of a scalar observation."""
+    a = analysis.adjustment
+    g = int(np.searchsorted(a.offsets, row, side="right")) - 1
+    group: Any = a.groups[g]
+    if isinstance(group, Direct):
+        i = row - int(a.offsets[g])
+        if group.kind == "camera":
+            return a.network.cameras[group.nodes[i]].unit_of(int(group.positions[i]))
+        if group.kind == "image":
+            return "rad" if group.positions[i] >= 3 else a.network.unit
+    return str(group.unit)
+
+
+def label_of(analysis: Analysis, row: int) -> str:
+    """Return the name of a scalar observation: image, point and component, or what is observed directly."""
+    test = result_of(analysis, "data_snooping")
+    return test.labels[row] if test is not None and test.labels else f"observation {row + 1}"
+
+
+def bare(name: str, analysis: Analysis) -> str:
+    """Return the name of a camera parameter without its camera where there is only one."""
+    cameras = analysis.adjustment.network.cameras
+    return name.removeprefix(f"camera {cameras[0].label}: ") if len(cameras) == 1 else name
+
+
+@dataclass(frozen=True)
+class Share:
+    """A part of the observations with its statistics; see `shares`."""
+
+    group: str
+    component: str
+    rows: Ints
+    unit: str
+    redundancy: float
+    rms: float
+    vpv: float
+
+    @property
+    def sigma0(self) -> float:
+        """The standard deviation of unit weight of this part, sqrt(v'Pv / sum of redundancy numbers)."""
+        return float(np.sqrt(self.vpv / self.redundancy)) if self.redundancy > 1e-10 and self.vpv >= 0.0 else float("nan")
+
+
+def shares(analysis: Analysis) -> list[Share]:
+    """Return the statistics of each observation group and, where it has several of few kinds, each component."""
+    a = analysis.adjustment
+    e = analysis.evidence
+    pv = e.residuals / e.sigmas**2 if e.pv is None else e.pv
+    energy, r = pv * e.residuals, a.redundancy_numbers
+    components = analysis.observations["component"]
+    out = []
+    for g, group in enumerate(a.groups):
+        rows = np.arange(a.offsets[g], a.offsets[g + 1])
+        kinds = list(dict.fromkeys(components[rows].tolist()))
+        parts = [("", rows)]
+        if 1 < len(kinds) <= 12:
+            parts += [(kind, rows[components[rows] == kind]) for kind in kinds]
+        for kind, at in parts:
+            units = {unit_of(analysis, int(i)) for i in at[: 2000 if isinstance(group, Direct) else 1]}
+            same = len(units) == 1
+            rms = float(np.sqrt(np.mean(e.residuals[at] ** 2))) if same else float("nan")
+            out.append(Share(group.name, kind, at, units.pop() if same else "", float(r[at].sum()), rms, float(energy[at].sum())))
+    return out
+
+
+def sensor_residuals(analysis: Analysis, camera: int) -> tuple[Floats, Floats]:
+    """Return measured positions and residuals of all image points of a camera, (n, 2) each, pixels."""
+    a = analysis.adjustment
+    xy, v = [np.zeros((0, 2))], [np.zeros((0, 2))]
+    for g, group in enumerate(a.groups):
+        if isinstance(group, ImagePoints):
+            chosen = a.network.images.cameras[group.images] == camera
+            xy.append(group.xy[chosen])
+            v.append(a.residuals[a.offsets[g] : a.offsets[g + 1]].reshape(-1, 2)[chosen])
+    return np.concatenate(xy), np.concatenate(v)
+
+
+def correlations(analysis: Analysis, limit: float = 0.95) -> list[tuple[str, str, float]]:
+    """Return the pairs of unknowns with a camera parameter whose correlation reaches the limit, the highest first.
+
+    Camera parameters among themselves, and with the orientation unknowns of the images.
+    """
+    a = analysis.adjustment
+    e = a.camera_estimates
+    if not e.names:
+        return []
+    c = correlation_matrix(e.cofactors)
+    found = [(e.names[i], e.names[j], float(c[i, j])) for i, j in zip(*np.nonzero(np.triu(np.abs(c) >= limit, 1)), strict=True)]
+    group = a.numbering["image"]
+    at = group.columns.reshape(-1, 6)
+    if len(e.names) <= MOST_COLUMNS and (at >= 0).any():
+        columns = np.array([a.numbering.column(name) for name in e.names], dtype=np.intp)
+        unit = np.zeros((a.numbering.count, len(columns)))
+        unit[columns, np.arange(len(columns))] = 1.0
+        q = a.cofactors.solve(unit)
+        nodes, positions = np.nonzero(at >= 0)
+        variances = np.einsum("nii->ni", a.cofactors.blocks(at))[nodes, positions]
+        scale = np.sqrt(np.maximum(variances[:, None] * np.diag(e.cofactors)[None, :], np.finfo(float).tiny))
+        r = q[at[nodes, positions]] / scale
+        for i, j in zip(*np.nonzero(np.abs(r) >= limit), strict=True):
+            name = f"image {group.labels[nodes[i]]}: {group.parameters_of(int(nodes[i]))[positions[i]]}"
+            found.append((e.names[j], name, float(r[i, j])))
+    return sorted(found, key=lambda pair: -abs(pair[2]))
+
+
+def correlation_matrix(cofactors: Floats) -> Floats:
+    """Return the correlations of a cofactor matrix."""
+    s = np.sqrt(np.maximum(np.diag(cofactors), np.finfo(float).tiny))
+    return np.asarray(cofactors / s[:, None] / s[None, :])
+
+
+def point_sigmas(analysis: Analysis) -> tuple[Any, Floats]:
+    """Return the point table and the (n, 3) standard deviations of the points; zero where a coordinate is fixed."""
+    table = analysis.adjustment.point_table(analysis.options.sigma)
+    return table, np.stack([table[f"s{axis}"] for axis in AXES], axis=1)
+
+
+def spatial(sigmas: Floats) -> Floats:
+    """Return the spatial standard deviation sqrt(sX^2 + sY^2 + sZ^2)."""
+    return np.asarray(np.sqrt((sigmas**2).sum(axis=1)))
+
+
+def first(count: int, most: int, where: str) -> str:
+    """Return the note of a shortened table, empty where it is whole."""
+    return f"The first {most} of {count} rows; all are in {where}." if count > most else ""
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """A point or an image at which more observations are suspected than chance would gather there."""
+
+    kind: str
+    label: str
+    suspected: int
+    tested: int
+    known: str  # "fixed control", "weighted control" or empty
+
+
+def clusters(analysis: Analysis) -> list[Cluster]:
+    """Return the points and images where suspected observations gather (binomial tail below 0.001 after Bonferroni), the largest first."""
+    from scipy import stats
+
+    rows = analysis.suspected
+    e, points = analysis.evidence, analysis.adjustment.network.points
+    tested = np.isfinite(analysis.tau)
+    out = []
+    for kind, codes, labels in (("point", e.points, e.point_names), ("image", e.images, e.image_names)):
+        if codes is None or len(rows) < 3:
+            continue
+        here = codes >= 0
+        total = np.bincount(codes[here & tested], minlength=len(labels))
+        found = np.bincount(codes[rows][codes[rows] >= 0], minlength=len(labels))
+        share = found.sum() / max(int(total.sum()), 1)
+        p = stats.binom.sf(found - 1, np.maximum(total, 1), share)
+        for i in np.flatnonzero((found >= 3) & (p * np.count_nonzero(total) < 0.001)):
+            known = ""
+            if kind == "point" and points.roles[i] == CONTROL:
+                known = "fixed control" if (points.states[i] == FIXED).all() else "weighted control"
+            out.append(Cluster(kind, labels[i], int(found[i]), int(total[i]), known))
+    return sorted(out, key=lambda c: -c.suspected)
+
+
+def insignificant(analysis: Analysis) -> tuple[list[str], Sequence[str]]:
+    """Return the names of the additional parameters that do not differ from zero, and of all that were tested."""
+    test = result_of(analysis, "additional_parameter")
+    if test is None:
+        return [], ()
+    return [bare(n, analysis) for n, r in zip(test.labels, np.asarray(test.rejected), strict=True) if not r], test.labels

@@ -1,0 +1,90 @@
+"""All tests: null hypothesis, statistic, law, limit, p-value, decision."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from baarda.hypotheses.base import TestResult
+from baarda.procedures.testing import Analysis
+from baarda.report.sections._numbers import fixed, plural, probability, significant
+from baarda.report.sections.base import Block, Cell, Column, DataTable, Items, Paragraph, SectionMaker, Tone, say
+
+
+def _limits(test: TestResult) -> str:
+    critical = test.critical
+    if isinstance(critical, tuple):
+        return f"{_short(critical[0])}..{_short(critical[1])}"
+    return _short(critical)
+
+
+def _tone(test: TestResult, rejected: bool, grave: Tone) -> Tone:
+    """A parameter that is not zero is what one hopes for; every other rejection is a contradiction."""
+    if "additional_parameter" in test.name:
+        return "good" if rejected else "warn"
+    return grave if rejected else "good"
+
+
+def _short(value: float) -> str:
+    return fixed(value, 1) if abs(value) >= 100.0 else fixed(value, 3) if abs(value) >= 1.0 else significant(value, 3)
+
+
+def _row(test: TestResult, mark: str) -> tuple[str | Cell, ...]:
+    """One row: a single test, or the extreme member of a family with the count beyond the limit."""
+    name = test.name.replace("_", " ")
+    if np.ndim(test.statistic):
+        p, statistic = np.asarray(test.p_value, dtype=float), np.asarray(test.statistic)
+        tested, beyond = int(np.isfinite(p).sum()), int(np.sum(test.rejected))
+        if not tested:
+            return (name, test.null + mark, "", "", test.law_name, "", f"{test.alpha:.3g}", "", Cell("not testable", "info"))
+        i = int(np.lexsort((-np.abs(np.nan_to_num(statistic)), np.where(np.isfinite(p), p, np.inf)))[0])
+        label = test.labels[i] if test.labels else f"number {i + 1}"
+        tone = _tone(test, bool(beyond), "warn")
+        decision = Cell(say("{beyond} of {tested} rejected", beyond=beyond, tested=tested), tone)
+        return (
+            name, test.null + mark, f"extreme: {label}", _short(float(statistic[i])), test.law_name, _limits(test), f"{test.alpha:.3g}",
+            probability(float(p[i])), decision,
+        )  # fmt: skip
+    decision = Cell("rejected" if test.rejected else "not rejected", _tone(test, bool(test.rejected), "bad"))
+    of = test.labels[0] if len(test.labels) == 1 else ""
+    return (
+        name, test.null + mark, of, _short(float(test.statistic)), test.law_name, _limits(test), f"{test.alpha:.3g}",
+        probability(float(test.p_value)), decision,
+    )  # fmt: skip
+
+
+def _build(analysis: Analysis) -> list[Block] | None:
+    if not analysis.tests:
+        return None
+    notes: dict[str, int] = {}
+    rows = []
+    for test in analysis.tests:
+        mark = ""
+        if test.note:
+            mark = f" [{notes.setdefault(test.note, len(notes) + 1)}]"
+        rows.append(_row(test, mark))
+    columns = (
+        Column("test", "", "name, with underscores in result.json", "left"),
+        Column("null hypothesis", "", "what is assumed true until the data contradict; [n] = note below", "left"),
+        Column("of", "", "of a family of equal tests its extreme member", "left"),
+        Column("statistic", "", "the number that is judged"),
+        Column("law", "", "law of the statistic if the null hypothesis is true", "left"),
+        Column("limit", "", "critical value, or the two of a two-sided test"),
+        Column("level", "", "probability of a wrong rejection by one single test"),
+        Column("p", "", "probability of a statistic at least as extreme if the null hypothesis is true"),
+        Column("decision", "", "", "left"),
+    )
+    families = sum(1 for t in analysis.tests if np.ndim(t.statistic))
+    intro = say(
+        "{count} were made, {families} of them for whole families of observations, images, parameters or points. A test that rejects "
+        "says that data and hypothesis do not fit; one that does not reject proves nothing. Additional parameters are welcome to "
+        "differ from zero.",
+        count=plural(len(analysis.tests), "test"),
+        families=families,
+    )
+    blocks: list[Block] = [Paragraph(intro), DataTable("All tests", columns, tuple(rows))]
+    if notes:
+        blocks.append(Items("Notes to the tests:", tuple(f"[{i}] {text}" for text, i in notes.items())))
+    return blocks
+
+
+TESTS = SectionMaker(100, "tests", "All tests", _build)

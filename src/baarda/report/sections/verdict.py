@@ -1,0 +1,331 @@
+"""The verdict: the outcome in five to eight plain sentences, each with number, limit and meaning."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from baarda.procedures.testing import Analysis
+from baarda.report.sections._facts import (
+    bare,
+    clusters,
+    image_rows,
+    insignificant,
+    judge,
+    label_of,
+    point_sigmas,
+    result_of,
+    spatial,
+    unit_of,
+)
+from baarda.report.sections._numbers import column, finer, fixed, names, plural, probability, significant
+from baarda.report.sections.base import Block, SectionMaker, Sentence, Tone, Verdict, say
+
+
+def sentences(analysis: Analysis) -> list[Sentence]:
+    """Return the sentences of the verdict, the most general first.
+
+    Parameters
+    ----------
+    analysis : Analysis
+
+    Returns
+    -------
+    list of Sentence
+        Five to eight; one where the adjustment did not converge.
+    """
+    if not analysis.converged:
+        return [_not_converged(analysis)]
+    parts = (_adjusted, _variance_factor, _parameters, _suspected, _hidden, _precision, _points, _law)
+    return [s for s in (part(analysis) for part in parts) if s is not None]
+
+
+def _not_converged(analysis: Analysis) -> Sentence:
+    a = analysis.adjustment
+    return Sentence(
+        "Convergence",
+        say(
+            "The adjustment did not converge in {steps} (v'Pv fell from {first} to {last}): the values are not a solution, and nothing "
+            "was tested.",
+            steps=plural(len(a.history) - 1, "iteration"),
+            first=significant(a.history[0].objective, 4),
+            last=significant(a.history[-1].objective, 4),
+        ),
+        "bad",
+        "data",
+    )
+
+
+def _adjusted(analysis: Analysis) -> Sentence:
+    a = analysis.adjustment
+    text = say(
+        "The adjustment converged in {steps}: {n} observations determine {u} unknowns with a redundancy of {r}, {share} per "
+        "observation on average.",
+        steps=plural(len(a.history) - 1, "iteration"),
+        n=a.count,
+        u=a.numbering.count,
+        r=a.redundancy,
+        share=fixed(a.redundancy / a.count, 2),
+    )
+    return Sentence("Adjustment", text, "good", "data")
+
+
+def _variance_factor(analysis: Analysis) -> Sentence | None:
+    test = result_of(analysis, "global_variance_factor")
+    if test is None or not isinstance(test.critical, tuple):
+        return None
+    a = analysis.adjustment
+    ratio = float(test.statistic) / a.redundancy
+    low, high = (c / a.redundancy for c in test.critical)
+    fields = {"value": fixed(ratio, 3), "low": fixed(low, 3), "high": fixed(high, 3), "times": significant(np.sqrt(ratio), 3)}
+    if not test.rejected:
+        text = "The variance factor {value} lies within {low}..{high}: the residuals are as large as the a-priori sigmas promise."
+    elif ratio > 1.0:
+        text = "The variance factor {value} lies outside {low}..{high}: the residuals are {times} times as large as the a-priori sigmas promise."
+    else:
+        text = (
+            "The variance factor {value} lies outside {low}..{high}: the residuals are only {times} times as large as the a-priori sigmas "
+            "promise; the observations are better than assumed."
+        )
+    return Sentence("Variance factor", say(text, **fields), "bad" if test.rejected else "good", "tests")
+
+
+def _parameters(analysis: Analysis) -> Sentence | None:
+    test = result_of(analysis, "additional_parameter")
+    if test is None or not isinstance(test.critical, tuple):
+        return None
+    weak, tested = insignificant(analysis)
+    fields = {"count": len(tested), "alpha": f"{test.alpha:.3g}", "limit": fixed(test.critical[1], 2)}
+    size = np.abs(np.asarray(test.statistic))
+    if not weak:
+        i = int(np.argmin(size))
+        text = say(
+            "All {count} additional camera parameters differ significantly from zero at level {alpha} (smallest |t| = {t} for {name}, "
+            "limit {limit}).",
+            t=significant(size[i], 3),
+            name=bare(tested[i], analysis),
+            **fields,
+        )
+        return Sentence("Camera model", text, "good", "cameras")
+    shown = ", ".join(weak[:6]) + (f" and {len(weak) - 6} more" if len(weak) > 6 else "")
+    text = say(
+        "{weak} of {count} additional camera parameters do not differ significantly from zero at level {alpha} (|t| below {limit}): "
+        "{names}; the model may do without them.",
+        weak=len(weak),
+        names=shown,
+        **fields,
+    )
+    return Sentence("Camera model", text, "warn", "cameras")
+
+
+def _suspected(analysis: Analysis) -> Sentence | None:
+    test = result_of(analysis, "data_snooping")
+    if test is None:
+        return None
+    name, values, limit = judge(analysis)
+    tested = int(np.isfinite(values).sum())
+    found = len(analysis.suspected)
+    fields = {"found": found, "tested": tested, "name": name, "limit": fixed(limit, 2)}
+    if not found:
+        worst = float(np.nanmax(np.abs(values))) if tested else float("nan")
+        text = say(
+            "No observation is suspected of a gross error: the largest of {tested} |{name}| is {worst}, the limit {limit}.",
+            worst=fixed(worst, 2),
+            **fields,
+        )
+        return Sentence("Gross errors", text, "good", "suspected")
+    row = int(analysis.suspected[0])
+    expected = tested * test.alpha
+    text = say(
+        "{found} of {tested} observations {verb} suspected of a gross error (|{name}| above {limit}; chance alone would show "
+        "{expected}); the worst is {label} with {name} = {value}: estimated error {error} {unit}.",
+        verb="is" if found == 1 else "are",
+        expected=significant(expected, 2),
+        label=label_of(analysis, row),
+        value=fixed(float(values[row]), 2),
+        error=significant(float(analysis.observations["estimated_error"][row]), 3),
+        unit=unit_of(analysis, row),
+        **fields,
+    )
+    gathered = [c for c in clusters(analysis) if c.kind == "point"]
+    if gathered:
+        share = sum(c.suspected for c in gathered)
+        where = names([c.label for c in gathered], 5)
+        text += " " + say("{count} of them gather at {points}.", count=share, points=f"point{'s' if len(gathered) > 1 else ''} {where}")
+    return Sentence("Gross errors", text, "warn" if within_chance(analysis) else "bad", "suspected")
+
+
+def within_chance(analysis: Analysis) -> bool:
+    """Return whether number and size of the suspected observations are what chance alone shows (level 0.01, independent tests)."""
+    test = result_of(analysis, "data_snooping")
+    if test is None:
+        return True
+    tested = int(np.isfinite(np.asarray(test.statistic)).sum())
+    many = len(analysis.suspected) > stats.binom.ppf(0.99, tested, test.alpha)
+    smallest = float(np.nanmin(test.p_value)) if tested else 1.0
+    return not many and smallest > 0.01 / max(tested, 1)
+
+
+def _hidden(analysis: Analysis) -> Sentence | None:
+    if result_of(analysis, "data_snooping") is None:
+        return None
+    rows = np.flatnonzero(image_rows(analysis))
+    what = "image coordinate"
+    if not len(rows):
+        rows, what = np.arange(analysis.adjustment.count), "observation"
+    values = analysis.observations["mdb"][rows]
+    lost = int(np.isnan(analysis.w).sum())
+    if not np.isfinite(values).any():
+        return Sentence("Reliability", say("No {what} is controlled by others: gross errors cannot be found.", what=what), "bad", "groups")
+    at = int(rows[int(np.nanargmax(values))])
+    shown = column([float(np.nanmedian(values)), float(np.nanmax(values))], 2)
+    text = say(
+        "A gross error in an {what} is found with probability {power} from {median} {unit} on (median); the least controlled one, "
+        "{label}, may hide up to {most} {unit}.",
+        what=what,
+        power=fixed(analysis.options.power, 2),
+        median=shown[0],
+        most=shown[1],
+        unit=unit_of(analysis, at),
+        label=label_of(analysis, at),
+    )
+    if lost:
+        text += " " + say(
+            "{count} controlled by no other: an error there stays hidden, whatever its size.",
+            count=plural(lost, "observation is", "observations are"),
+        )
+    return Sentence("Reliability", text, "warn" if lost else "info", "groups")
+
+
+def _precision(analysis: Analysis) -> Sentence | None:
+    table, sigmas = point_sigmas(analysis)
+    free = (sigmas > 0.0).any(axis=1)
+    if not free.any():
+        return None
+    whole = spatial(sigmas)
+    weakest = int(np.argmax(np.where(free, whole, -1.0)))
+    medians = np.median(sigmas[free], axis=0)
+    unit, factor = finer(analysis.adjustment.network.unit, sigmas[free])
+    shown = column(np.append(medians, whole[weakest]) * factor, 2)
+    text = say(
+        "The object points have standard deviations of {x} / {y} / {z} {unit} in X / Y / Z (medians, {scaling}); the weakest is point "
+        "{name} with {most} {unit} in space.",
+        x=shown[0],
+        y=shown[1],
+        z=shown[2],
+        unit=unit,
+        scaling="a posteriori" if analysis.options.sigma == "aposteriori" else "a priori",
+        name=table["point"][weakest],
+        most=shown[3],
+    )
+    return Sentence("Precision", text, "info", "points")
+
+
+def _points(analysis: Analysis) -> Sentence | None:
+    parts, tone = [], "good"
+    e = analysis.evidence.check
+    check, each = result_of(analysis, "check_points"), result_of(analysis, "check_point")
+    if check is not None and e is not None:
+        count = len(set(e.groups))
+        beyond = [] if each is None else [n for n, r in zip(each.labels, np.asarray(each.rejected), strict=True) if r]
+        rms = float(np.sqrt(np.sum(np.square(e.values)) / count))
+        unit, factor = finer(analysis.adjustment.network.unit, [rms])
+        template = (
+            "{points} from the survey by more than the predicted precision allows (T = {t}, limit {limit}; RMSE {rms} {unit}; beyond: "
+            "{names})."
+            if check.rejected or beyond
+            else "{points} from the survey by no more than the predicted precision allows (T = {t}, limit {limit}; RMSE {rms} {unit})."
+        )
+        parts.append(
+            say(
+                template,
+                points=plural(count, "check point differs", "check points differ"),
+                t=fixed(float(check.statistic), 2),
+                limit=fixed(_upper(check.critical), 2),
+                rms=significant(rms * factor, 3),
+                unit=unit,
+                names=", ".join(beyond[:5]) + (" ..." if len(beyond) > 5 else "") if beyond else "none singly",
+            )
+        )
+        tone = "bad" if check.rejected or beyond else tone
+    control, each = result_of(analysis, "control_points"), result_of(analysis, "control_point")
+    if control is not None and each is not None:
+        count = len(each.labels)
+        beyond = int(np.sum(each.rejected))
+        template = (
+            "The weighted control contradicts its sigmas (T = {t}, limit {limit}): {beyond} of {count} points are rejected, the worst "
+            "is {name}."
+            if control.rejected
+            else "The weighted control agrees with its sigmas (T = {t}, limit {limit}; {beyond} of {count} points rejected singly)."
+        )
+        parts.append(
+            say(
+                template,
+                t=fixed(float(control.statistic), 2),
+                limit=fixed(_upper(control.critical), 2),
+                beyond=beyond,
+                count=count,
+                name=each.details.get("extreme", {}).get("label", ""),
+            )
+        )
+        tone = "bad" if control.rejected else tone
+    if not parts:
+        return None
+    link = "check-control"
+    return Sentence("Control and check points", " ".join(parts), "bad" if tone == "bad" else "good", link)
+
+
+def _upper(critical: float | tuple[float, float]) -> float:
+    return critical[1] if isinstance(critical, tuple) else critical
+
+
+def _law(analysis: Analysis) -> Sentence | None:
+    laws = [f for f in analysis.laws if f.aic is not None]
+    normal = next((f for f in laws if f.law == "normal"), None)
+    if normal is None or normal.statistic is None or normal.critical is None:
+        return None
+    best = min(laws, key=lambda f: f.aic if f.aic is not None else np.inf)
+    fields = {
+        "chi": fixed(normal.statistic, 1),
+        "limit": fixed(normal.critical, 1),
+        "p": _p_word(normal.p_value),
+        "best": law_name(best.law, best.parameters.get("a")),
+    }
+    tone: Tone = "warn" if normal.rejected else "good"
+    if not normal.rejected:
+        text = "The standardised residuals follow the normal law (chi-square {chi}, limit {limit}, p {p})."
+        if best.law != "normal":
+            text += " The {best} has the better AIC, but not by enough to reject the normal."
+    elif best.law == "normal":
+        text = "The standardised residuals do not follow the normal law (chi-square {chi}, limit {limit}, p {p}); no other law tried fits better."
+    else:
+        text = (
+            "The standardised residuals do not follow the normal law (chi-square {chi}, limit {limit}, p {p}); of the laws tried the "
+            "{best} fits "
+            "best by AIC" + (", though it is rejected too." if best.rejected else ".")
+        )
+    return Sentence("Law of residuals", say(text, **fields), tone, "law")
+
+
+def _p_word(p: float | None) -> str:
+    text = probability(p)
+    return text if text.startswith("<") else f"= {text}"
+
+
+def law_name(law: str, a: float | None = None) -> str:
+    """Return the name of a law in words.
+
+    Examples
+    --------
+    >>> law_name("modulated_normal", -0.143), law_name("radico", 0.5)
+    ('modulated normal law (a = -0.14)', 'radico law')
+    """
+    words = law.replace("_", " ")
+    return f"{words} law (a = {significant(a, 2)})" if law == "modulated_normal" and a is not None else f"{words} law"
+
+
+def _build(analysis: Analysis) -> list[Block]:
+    return [Verdict(tuple(sentences(analysis)))]
+
+
+VERDICT = SectionMaker(10, "verdict", "Verdict", _build)

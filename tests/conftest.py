@@ -1,0 +1,29 @@
+"""Where tests find data."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+SHARED = Path(os.environ.get("BAARDA_DATA", HERE.parent.parent / "shared" / "data"))
+
+
+def data_folder(name: str) -> Path:
+    """Return a data folder of the repository, else of the shared data; skip the test where it is absent."""
+    for place in (HERE / "data" / name, SHARED / name):
+        if place.is_dir():
+            return place
+    pytest.skip(f"data set {name} is not here (set BAARDA_DATA)")
+
+
+@pytest.fixture(scope="session")
+def data():
+    """A function from the name of a data set to its folder."""
+    return data_folder
+
+
+@pytest.fixture(scope="session")
+def camcal() -> Path:
+    """The script of the bundled camera calibration."""
+    return HERE.parent / "src" / "baarda" / "data" / "camcal" / "camcaldemo.xml"
