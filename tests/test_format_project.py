@@ -1,5 +1,6 @@
 """Our own project format: the round trip is exact, hostile and broken input is refused with file and line."""
 
+import random
 import re
 import time
 from dataclasses import fields, replace
@@ -491,6 +492,20 @@ def test_line_numbers_count_lines_within_quotes(tmp_path):
     text = 'image,X0\n"A\n\nwith breaks",0\nA,1\n\nB,zwei\n'
     with pytest.raises(InputError, match=r"images.csv, line 7: X0 is not a number: 'zwei'"):
         project.read(folder(tmp_path, images__csv=text))
+
+
+def test_any_changed_character_is_read_or_refused(tmp_path):
+    rng = random.Random(0)
+    where = folder(tmp_path)
+    for name, text in HAND.items():
+        for k in range(len(text)):
+            new = rng.choice(["", "\n", ",", '"', "-", "9", "e", "\x00", "1e308", "ü", "=", "["])
+            (where / name).write_text(text[:k] + new + text[k + 1 :], encoding="utf-8", newline="")
+            try:
+                assert isinstance(project.read(where), Network)
+            except InputError as error:
+                assert str(where) in str(error)
+        (where / name).write_text(text, encoding="utf-8", newline="")
 
 
 def test_same_point_twice_is_accepted_where_the_group_says_so(tmp_path):

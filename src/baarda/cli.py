@@ -112,7 +112,7 @@ def demo(
 @app.command()
 @guarded
 def adjust(
-    source: Annotated[Path, typer.Argument(help="File or folder of any known format.")],
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="File or folder of any known format.")],
     out: Out = None,
     format: FormatName = None,
     control: Control = None,
@@ -153,7 +153,7 @@ def adjust(
 @app.command()
 @guarded
 def convert(
-    source: Annotated[Path, typer.Argument(help="File or folder of any known format.")],
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="File or folder of any known format.")],
     to: Annotated[str, typer.Option("--to", help="Format to write.")],
     out: Annotated[Path, typer.Option("--out", help="File or folder to write; must not exist.")],
     format: FormatName = None,

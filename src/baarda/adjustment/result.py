@@ -319,8 +319,9 @@ class Adjustment:
             return None
         from scipy.linalg import block_diag
 
-        q = block_diag(*cofactors) - self.cofactors.of(np.concatenate(columns))
-        return Estimates(tuple(names), self.residuals[np.concatenate(rows)], 0.5 * (q + q.T), None, tuple(labels))
+        prior = block_diag(*cofactors)
+        q = prior - self.cofactors.of(np.concatenate(columns))
+        return Estimates(tuple(names), self.residuals[np.concatenate(rows)], 0.5 * (q + q.T), prior, tuple(labels))
 
     @cached_property
     def evidence(self) -> Evidence:

@@ -32,9 +32,9 @@ class SciPyLaw(stats.rv_continuous):
     def _updated_ctor_param(self) -> dict[str, Any]:
         return dict(super()._updated_ctor_param()) | {"member": self._member}  # type: ignore[misc]
 
-    def _all(self, args: tuple[Any, ...]) -> tuple[Any, ...]:
-        """All shapes of the class, the fixed ones included, as arrays."""
-        own = dict(zip((s.name for s in self._member.free_shapes), args, strict=True))
+    def _all(self, args: tuple[Any, ...], named: Mapping[str, Any] | None = None) -> tuple[Any, ...]:
+        """All shapes of the class, the fixed ones included, as arrays; SciPy's newer distributions pass them by name."""
+        own = dict(named or {}) or dict(zip((s.name for s in self._member.free_shapes), args, strict=True))
         held = dict(self._member.fixed)
         return tuple(np.asarray(own.get(s.name, held.get(s.name)), dtype=float) for s in self._member.distribution.shapes)
 
@@ -49,23 +49,23 @@ class SciPyLaw(stats.rv_continuous):
 
         return [_ShapeInfo(s.name, False, (s.lower, s.upper), (False, s.upper_closed)) for s in self._member.free_shapes]
 
-    def _pdf(self, x: Any, *args: Any) -> Any:
-        return self._member.distribution._pdf(x, *self._all(args))
+    def _pdf(self, x: Any, *args: Any, **named: Any) -> Any:
+        return self._member.distribution._pdf(x, *self._all(args, named))
 
-    def _logpdf(self, x: Any, *args: Any) -> Any:
-        return self._member.distribution._logpdf(x, *self._all(args))
+    def _logpdf(self, x: Any, *args: Any, **named: Any) -> Any:
+        return self._member.distribution._logpdf(x, *self._all(args, named))
 
-    def _cdf(self, x: Any, *args: Any) -> Any:
-        return self._member.distribution._cdf(x, *self._all(args))
+    def _cdf(self, x: Any, *args: Any, **named: Any) -> Any:
+        return self._member.distribution._cdf(x, *self._all(args, named))
 
-    def _sf(self, x: Any, *args: Any) -> Any:
-        return self._member.distribution._sf(x, *self._all(args))
+    def _sf(self, x: Any, *args: Any, **named: Any) -> Any:
+        return self._member.distribution._sf(x, *self._all(args, named))
 
-    def _ppf(self, q: Any, *args: Any) -> Any:
-        return self._member.distribution._ppf(q, *self._all(args))
+    def _ppf(self, q: Any, *args: Any, **named: Any) -> Any:
+        return self._member.distribution._ppf(q, *self._all(args, named))
 
-    def _isf(self, q: Any, *args: Any) -> Any:
-        return self._member.distribution._isf(q, *self._all(args))
+    def _isf(self, q: Any, *args: Any, **named: Any) -> Any:
+        return self._member.distribution._isf(q, *self._all(args, named))
 
     def _rvs(self, *args: Any, size: Any = None, random_state: Any = None) -> Any:
         rng = random_state

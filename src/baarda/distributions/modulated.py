@@ -131,7 +131,7 @@ def _argument(z: Floats, a: Floats) -> tuple[Floats, Floats, Floats]:
 
 def _factor(a: Floats) -> Floats:
     """(a+1) / (sigma sqrt(2 pi)) for unit standard deviation."""
-    return (a + 1.0) * np.sqrt((a + 1.0) / (a + 2.0)) / np.sqrt(2.0 * np.pi)
+    return np.asarray((a + 1.0) * np.sqrt((a + 1.0) / (a + 2.0)) / np.sqrt(2.0 * np.pi))
 
 
 def _pdf(z: Floats, a: Floats) -> Floats:

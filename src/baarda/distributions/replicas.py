@@ -38,7 +38,7 @@ def refit_columns(member: Law, x: Floats, start: Distribution, given: Mapping[st
     Notes
     -----
     Fisher scoring with the information matrix at the start, halved steps where the likelihood falls, and projection on the bounds;
-    it stops at a hundredth of a standard error. Shapes that are expensive to vary are taken from a grid of a tenth of a standard error.
+    it stops at a hundredth of a standard error. Shapes that are expensive to vary are taken from a grid of 0.03 standard errors.
 
     Examples
     --------
@@ -142,7 +142,7 @@ def _scoring(member: Law, x: Floats, values: dict[str, Floats], free: tuple[str,
 
     value, gradient, information = evaluate(theta, slice(None))
     errors = np.sqrt(np.diag(np.linalg.inv(information)) / n)
-    grid = {i: 0.1 * errors[i] for i, name in enumerate(free) if name in shapes and member.distribution.by_shape}
+    grid = {i: 0.03 * errors[i] for i, name in enumerate(free) if name in shapes and member.distribution.by_shape}
     active = np.arange(replicas)
     shrink = np.ones(replicas)
     for _ in range(_ROUNDS):

@@ -63,7 +63,10 @@ class Student(Distribution):
     def _gradient(cls, z: Floats, *shapes: Any) -> tuple[Floats, ...]:
         nu, at_limit = _finite(shapes[0])
         square = z * z
-        constant = special.psi(0.5 * (nu + 1.0)) - special.psi(0.5 * nu) - 1.0 / nu
+        x = 0.5 * nu
+        # psi(x + 1/2) - psi(x) - 1/(2x): its asymptotic series where the difference would cancel
+        far = (0.125 - (1.0 / 64.0 - 1.0 / (128.0 * x * x)) / (x * x)) / (x * x)
+        constant = np.where(x > 50.0, far, special.psi(x + 0.5) - special.psi(x) - 0.5 / x)
         slope = 0.5 * (constant - np.log1p(square / nu) + (nu + 1.0) * square / (nu * (nu + square)))
         return (np.where(at_limit, 0.0, slope),)
 

@@ -83,9 +83,10 @@ def rotation_matrices(matrices: Floats, error: Complaint) -> None:
     error : callable
         Row to error.
     """
-    misfit = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-    improper = np.einsum("ni,ni->n", np.cross(matrices[:, 0], matrices[:, 1]), matrices[:, 2]) < 0.0
-    bad = np.flatnonzero((misfit > 1e-6) | improper)
+    with np.errstate(over="ignore", invalid="ignore"):
+        misfit = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+        improper = np.einsum("ni,ni->n", np.cross(matrices[:, 0], matrices[:, 1]), matrices[:, 2]) < 0.0
+    bad = np.flatnonzero(~np.isnan(matrices).any(axis=(1, 2)) & (~(misfit <= 1e-6) | improper))
     if len(bad):
         raise error(int(bad[0]), "the matrix is not a rotation (orthonormal with determinant +1)")
 
@@ -101,7 +102,8 @@ def correlations(values: Floats, error: Complaint) -> None:
         Row to error.
     """
     xy, xz, yz = values.T
-    determinant = 1.0 + 2.0 * xy * xz * yz - xy**2 - xz**2 - yz**2
+    with np.errstate(over="ignore", invalid="ignore"):
+        determinant = 1.0 + 2.0 * xy * xz * yz - xy**2 - xz**2 - yz**2
     bad = np.flatnonzero((np.abs(values) >= 1.0).any(axis=1) | ~(determinant > 0.0))
     if len(bad):
         raise error(int(bad[0]), "the correlations are not those of a covariance matrix (positive definite)")
@@ -124,7 +126,11 @@ def guessed_unit(unit: str, factor: float) -> str:
 
 def _size(xyz: Floats) -> float:
     """Return the size of a cloud of points that a few gross errors do not change."""
-    return float(np.median(np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1))) if len(xyz) > 1 else 0.0
+    return float(np.median(_lengths(xyz - np.median(xyz, axis=0)))) if len(xyz) > 1 else 0.0
+
+
+def _lengths(vectors: Floats) -> Floats:
+    return np.asarray(np.hypot(np.hypot(vectors[:, 0], vectors[:, 1]), vectors[:, 2]))  # no overflow on the way
 
 
 def control_unit(points: Points, unit: str, error: Complaint, position: Floats | None = None) -> None:
@@ -164,7 +170,7 @@ def control_unit(points: Points, unit: str, error: Complaint, position: Floats |
     elif position is not None:
         position = position[np.isfinite(position).all(axis=1)]
         if len(position) and size > 0.0:
-            away = float(np.median(np.linalg.norm(position - np.median(control, axis=0), axis=1)))
+            away = float(np.median(_lengths(position - np.median(control, axis=0))))
             if away > 0.0 and not 1 / 200 < size / away < 200:
                 raise error(int(known[0]), _wrong_unit(size, away, "start values of the cameras, away from the control,", unit))
 
@@ -186,7 +192,7 @@ def distance_unit(group: Distances, points: Points, unit: str, error: Complaint)
     error : callable
         Row to error.
     """
-    apart = np.linalg.norm(points.coordinates[group.ends] - points.coordinates[group.starts], axis=1)
+    apart = _lengths(points.coordinates[group.ends] - points.coordinates[group.starts])
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = group.values / apart
     usable = ratio[np.isfinite(ratio)]

@@ -67,10 +67,9 @@ def read(path: Path) -> Network:
     notes: list[str] = []
     kinds = [kind for kind in ("bin", "txt") if all((path / f"{part}.{kind}").is_file() for part in PARTS)]
     if not kinds:
-        missing = next(
-            p for kind in ("bin", "txt") if (path / f"cameras.{kind}").is_file() for p in PARTS if not (path / f"{p}.{kind}").is_file()
-        )
-        raise InputError(f"{missing} is missing beside the other files of the COLMAP model", path)
+        have = [p for kind in ("bin", "txt") for p in PARTS if (path / f"{p}.{kind}").is_file()]
+        missing = ", ".join(p for p in PARTS if p not in have)
+        raise InputError(f"not a COLMAP model: {missing} is missing (a folder with cameras, images and points3D, all .bin or all .txt)", path)
     if len(kinds) == 2:
         notes.append("the folder holds a binary and a text model: the binary one is used, as COLMAP does")
     kind = kinds[0]

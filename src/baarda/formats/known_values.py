@@ -109,7 +109,10 @@ def known_values(
         _complain(table, (state == OBSERVED) & ~np.isfinite(sigma), f"{name} is observed, but sigma_{name} is missing")
         start = np.where((state == FIXED) & np.isnan(start), value, start)
         _complain(table, (state == FIXED) & np.isnan(start), f"{name} is fixed, but has no value")
-        difference = np.remainder(start - value + np.pi, 2.0 * np.pi) - np.pi if name in ANGLES else start - value
+        with np.errstate(over="ignore"):  # an infinite difference is one
+            difference = start - value
+        if name in ANGLES:
+            difference = np.remainder(difference + np.pi, 2.0 * np.pi) - np.pi
         apart = np.abs(difference) > 1e-9 * (1.0 + np.abs(value))
         _complain(table, (state == FIXED) & apart, f"{name} is fixed, but its start value differs from given_{name}")
         values[:, j], states[:, j], given[:, j], sigmas[:, j] = start, state, value, sigma

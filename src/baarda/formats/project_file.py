@@ -150,7 +150,7 @@ def _line_of(text: str, where: tuple[int | str, ...]) -> int | None:
     lines = text.splitlines()
     start = 0
     for i, part in enumerate(where):
-        pattern = rf"\s*\[+\s*{re.escape(str(part))}\s*\]+"
+        pattern = rf"""\s*\[+\s*["']?{re.escape(str(part))}["']?\s*[\].]"""
         nth = where[i + 1] if i + 1 < len(where) and isinstance(where[i + 1], int) else 0
         found = [k for k, line in enumerate(lines) if re.match(pattern, line)]
         if len(found) > int(nth):

@@ -143,7 +143,8 @@ class Estimates:
     cofactors : (k, k) array
         Their joint cofactor matrix Q from the adjustment; covariance = variance factor times Q.
     reference_covariance : (k, k) array or None
-        Covariance of an independent reference that was subtracted (survey of check points), None when exact.
+        Covariance of an independent reference that was subtracted (survey of check points; a priori covariance of control), None
+        when exact.
     groups : tuple of str
         One group label per number: the camera of a parameter, the point of a check difference.
     """
@@ -166,7 +167,7 @@ class Evidence:
     sigmas : (n,) array
         A-priori standard deviations (for variance factor `sigma0_apriori` squared).
     qvv : (n,) array
-        Diagonal of the cofactor matrix of the residuals, for `sigma0_apriori` = 1.
+        Diagonal of the cofactor matrix of the residuals: variance = variance factor times qvv.
     redundancy_numbers : (n,) array
         Diagonal of Qvv P; sums to `redundancy`.
     pv, pqvvp : (n,) arrays

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
+from html import escape
 from importlib import resources
 from typing import Any
 
@@ -56,7 +57,18 @@ def verdict(analysis: Analysis) -> list[str]:
     -------
     list of str
     """
-    return [s.text for s in sentences(analysis)]
+    return [printable(s.text) for s in sentences(analysis)]
+
+
+def printable(words: str) -> str:
+    r"""Return text without the characters that steer a terminal or turn the direction of writing; names come from strangers.
+
+    Examples
+    --------
+    >>> printable("point \x1b[2J7")
+    'point �[2J7'
+    """
+    return words if words.isprintable() else "".join(c if c.isprintable() else "\ufffd" for c in words)
 
 
 def figures(made: list[Section]) -> dict[str, str]:
@@ -75,11 +87,10 @@ def figures(made: list[Section]) -> dict[str, str]:
 
 def _labelled(figure: Figure) -> str:
     """Return the SVG with title and description for those who do not see it."""
-    from html import escape
-
-    said = f"<title>{escape(figure.title)}</title>\n<desc>{escape(figure.alt)}</desc>"
+    alt = escape(printable(figure.alt))
+    said = f"<title>{escape(printable(figure.title))}</title>\n<desc>{alt}</desc>"
     head, rest = figure.svg.split(">", 1)
-    return f'{head} role="img" aria-label="{escape(figure.alt)}">\n {said}{rest}'
+    return f'{head} role="img" aria-label="{alt}">\n {said}{rest}'
 
 
 def text(made: list[Section]) -> str:
@@ -107,7 +118,7 @@ def text(made: list[Section]) -> str:
         lines += [*([""] if lines else []), head, "=" * len(head)]
         for block in section.blocks:
             lines += ["", *_text(block)]
-    return "\n".join(line.rstrip() for line in lines) + "\n"
+    return "\n".join(printable(line.rstrip()) for line in lines) + "\n"
 
 
 def _text(block: Block) -> list[str]:
@@ -134,7 +145,7 @@ def _plain(cell: str | Cell) -> str:
 def _text_table(table: DataTable) -> list[str]:
     heads = [[c.name for c in table.columns], [f"({c.unit})" if c.unit else "" for c in table.columns]]
     body = [[_plain(c) for c in row] for row in table.rows]
-    most = 44
+    most = 44 if len(table.columns) > 3 else 72
     grid: list[list[str]] = [h for h in heads if any(h)]
     rule = len(grid)
     for row in body:
@@ -180,7 +191,14 @@ def html(analysis: Analysis, made: list[Section]) -> str:
     def load(name: str) -> str:
         return (folder / name).read_text(encoding="utf-8")
 
-    environment = Environment(autoescape=True, loader=FunctionLoader(load), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(
+        autoescape=True,
+        finalize=lambda value: printable(value) if type(value) is str else value,
+        loader=FunctionLoader(load),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     environment.tests["cell"] = lambda value: isinstance(value, Cell)
     net = analysis.adjustment.network
     context: dict[str, Any] = {
@@ -218,19 +236,22 @@ def _facts(analysis: Analysis) -> list[tuple[str, str]]:
     return [*facts, ("s0", f"{a.sigma0:.3f}")] if analysis.converged else facts
 
 
-def _inline(figure: Figure) -> Any:
+def _inline(figure: Figure) -> str:
     """Return the SVG for a page: colours follow the page, no namespaces (an HTML parser knows them)."""
-    from markupsafe import Markup
-
     svg = re.sub(r' xmlns(:xlink)?="[^"]*"', "", figure.svg, count=2)
     svg = re.sub(r"<defs>\s*<style type=\"text/css\">[^<]*</style>\s*</defs>\s*", "", svg, count=1)
-    for colour, variable in ((plots.INK, "ink"), (plots.MUTED, "muted"), (plots.LINE, "line")):
+    for colour, variable in (
+        (plots.INK, "ink"),
+        (plots.MUTED, "muted"),
+        (plots.LINE, "line"),
+        (plots.BLUE, "blue"),
+        (plots.ORANGE, "orange"),
+        (plots.GREEN, "green"),
+    ):
         svg = svg.replace(f": {colour}", f": var(--{variable})")
     head, rest = svg.split(">", 1)
     head = re.sub(r' (width|height)="[^"]*"', "", head)
     width = re.search(r'viewBox="0 0 ([\d.]+)', head)
-    style = f'style="width: {float(width[1]) / 72 * 96:.0f}px"' if width else ""
-    # The drawing escapes its own text; the words around it are escaped here.
-    return Markup('{head} role="img" aria-label="{alt}" {style}>{rest}').format(
-        head=Markup(head), alt=figure.alt, style=Markup(style), rest=Markup(rest)
-    )  # fmt: skip
+    style = f' style="width: {float(width[1]) / 72 * 96:.0f}px"' if width else ""
+    # matplotlib escapes the text inside of the drawing.
+    return f'{head} role="img" aria-label="{escape(printable(figure.alt))}"{style}>{rest}'

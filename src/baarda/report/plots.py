@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -84,15 +85,18 @@ def drawn(name: str, size: tuple[float, float], draw: Callable[[Any], None]) -> 
     from matplotlib.figure import Figure
 
     out = io.StringIO()
-    with matplotlib.rc_context():
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")  # the reader's fonts draw the text, not ours
         # From matplotlib's own defaults: a user's matplotlibrc changes no report.
         matplotlib.rcdefaults()
-        matplotlib.rcParams.update(_STYLE)
+        settings: Any = matplotlib.rcParams
+        settings.update(_STYLE)
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasSVG(figure)
         draw(figure)
         figure.savefig(out, format="svg", dpi=150, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    return _own(out.getvalue(), name)
+    # Names come from strangers: nothing that XML forbids, nothing that turns the direction of writing.
+    return _own("".join(c if c.isprintable() or c == "\n" else "\ufffd" for c in out.getvalue()), name)
 
 
 def _own(svg: str, name: str) -> str:
@@ -104,7 +108,7 @@ def _own(svg: str, name: str) -> str:
     def tag(match: re.Match[str]) -> str:
         text = re.sub(r'\b(id|xlink:href|href)="(#?)([A-Za-z][^":]*)"', rf'\1="\2{name}-\3"', match[0])
         text = re.sub(r"url\(#([^)]*)\)", rf"url(#{name}-\1)", text)
-        text = re.sub(r"(\d\.\d{3})\d+\b", r"\1", text)  # a thousandth of a point is enough
+        text = re.sub(r"(\d\.\d{2})\d+\b", r"\1", text) if " d=" in text else text  # paths: a hundredth of a point is enough
         return re.sub(r"(font-family: |font: [^'\";]*px )[^;\"]*", rf"\1{_FONTS}", text)
 
     # Inside of text matplotlib writes no bare '<' or '>': what stands between them is a tag.
@@ -174,11 +178,11 @@ def histogram(
         axes.legend(loc="upper right")
         _quiet(axes, "y")
 
-    return drawn(name, (5.5, 3.6), draw)
+    return drawn(name, (5.2, 3.6), draw)
 
 
 def quantiles(
-    values: Floats, other: tuple[str, Callable[[Floats], Floats]] | None, label: str, name: str = "quantiles", most: int = 600
+    values: Floats, other: tuple[str, Callable[[Floats], Floats]] | None, label: str, name: str = "quantiles", most: int = 300
 ) -> str:
     """Return the normal Q-Q plot of standardised residuals with its 95 % band, and the line of another law.
 
@@ -201,7 +205,7 @@ def quantiles(
     rank = np.unique(np.concatenate([np.arange(ends), np.linspace(0, n - 1, most).round().astype(int), np.arange(n - ends, n)])) + 1
     q = (rank - 0.5) / n
     x = stats.norm.ppf(q)
-    low, high = stats.norm.ppf(stats.beta.ppf([[0.025], [0.975]], rank, n + 1 - rank))
+    low, high = (np.asarray(stats.norm.ppf(stats.beta.ppf(p, rank, n + 1 - rank))) for p in (0.025, 0.975))
 
     def draw(figure: Any) -> None:
         axes = figure.add_subplot()
@@ -215,7 +219,7 @@ def quantiles(
         axes.legend(loc="upper left")
         _quiet(axes)
 
-    return drawn(name, (5.5, 3.6), draw)
+    return drawn(name, (5.2, 3.6), draw)
 
 
 def heat_map(matrix: Floats, labels: Sequence[str], name: str) -> str:
@@ -310,36 +314,36 @@ def vectors(
     length = np.hypot(v[:, 0], v[:, 1])
     typical = float(np.quantile(length, 0.9)) or 1.0
     spacing = float(np.sqrt(width * height / max(len(at), 1)))
-    scale = (
-        1.1 * float(np.clip(spacing, 0.02 * max(width, height), 0.1 * max(width, height))) / typical
-    )  # drawn pixels per pixel of residual
+    longer = max(width, height)
+    scale = 1.1 * float(np.clip(spacing, 0.02 * longer, 0.1 * longer)) / typical  # drawn pixels per pixel of residual
+    rim = 0.05 * longer
     arrow = nice(1.5 * typical)
     across = 6.4 if width >= height else 5.2
     chosen = np.asarray(marked, dtype=bool)
 
     def draw(figure: Any) -> None:
+        from matplotlib.patches import Rectangle
+
         axes = figure.add_subplot()
         many = len(at) > MOST_MARKS
         style = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / scale, "headwidth": 3.8, "headlength": 4.4, "headaxislength": 4.0}
         for rows, colour, thick in ((~chosen, BLUE, 0.0022), (chosen, ORANGE, 0.0034)):
             if rows.any():
                 axes.quiver(*at[rows].T, *v[rows].T, color=colour, width=thick, rasterized=many, zorder=3, **style)
-        axes.set_xlim(frame[0], frame[1])
-        axes.set_ylim(*((frame[3], frame[2]) if y_down else (frame[2], frame[3])))
+        axes.add_patch(Rectangle((frame[0], frame[2]), width, height, fill=False, edgecolor=MUTED, linewidth=0.8))
+        axes.set_xlim(frame[0] - rim, frame[1] + rim)
+        axes.set_ylim(*((frame[3] + rim, frame[2] - rim) if y_down else (frame[2] - rim, frame[3] + rim)))
+        for spine in axes.spines.values():
+            spine.set_visible(False)
         axes.set_aspect("equal")
         axes.set_xlabel("image x (px)")
         axes.set_ylabel(f"image y (px), {'downwards' if y_down else 'upwards'}")
         axes.grid(True)
         axes.tick_params(length=3)
         # The scale arrow stands above the frame, in the units of the axes: as long as a vector of that size.
-        share = arrow * scale / width
-        axes.annotate(
-            "",
-            (0.0, 1.045),
-            (share, 1.045),
-            "axes fraction",
-            arrowprops={"arrowstyle": "<-", "color": INK, "linewidth": 1.1, "shrinkA": 0, "shrinkB": 0},
-        )
+        share = arrow * scale / (width + 2.0 * rim)
+        straight = {"arrowstyle": "<-", "color": INK, "linewidth": 1.1, "shrinkA": 0, "shrinkB": 0}
+        axes.annotate("", (0.0, 1.045), (share, 1.045), "axes fraction", arrowprops=straight)
         axes.text(share + 0.015, 1.045, f"{arrow:g} {unit}", transform=axes.transAxes, va="center", fontsize=8.5)
         if chosen.any():
             axes.text(1.0, 1.045, word, transform=axes.transAxes, va="center", ha="right", fontsize=8.5, color=ORANGE)
@@ -391,13 +395,11 @@ def plan(
         shown = None
         for kind, (marker, area) in marks.items():
             style = {"marker": marker, "rasterized": len(points) > MOST_MARKS, "zorder": 3 if kind == "tie" else 4}
-            rim = {"linewidth": 0.0} if kind == "tie" else {"linewidth": 0.9, "edgecolors": INK}
+            rim = {"linewidth": 0.35, "edgecolors": MUTED} if kind == "tie" else {"linewidth": 0.9, "edgecolors": INK}
             at = np.flatnonzero((kinds == kind) & free)
             if len(at):
-                shown = axes.scatter(
-                    points[at, 0] - origin[0], points[at, k] - origin[k], area, c=sigmas[at], cmap="viridis", vmin=limits[0], vmax=limits[1],
-                    label=f"{kind} points", **style, **rim,
-                )  # fmt: skip
+                colours = {"c": sigmas[at], "cmap": "viridis", "vmin": limits[0], "vmax": limits[1]}
+                shown = axes.scatter(*(points[at][:, [0, k]] - origin[[0, k]]).T, area, label=f"{kind} points", **colours, **style, **rim)
             at = np.flatnonzero((kinds == kind) & ~free)
             if len(at):
                 axes.scatter(points[at, 0] - origin[0], points[at, k] - origin[k], area, facecolors="none", edgecolors=INK, linewidths=0.9,

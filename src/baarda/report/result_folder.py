@@ -126,8 +126,9 @@ def _test(t: TestResult) -> dict[str, Any]:
         p, statistic = np.asarray(t.p_value), np.asarray(t.statistic)
         tested = np.isfinite(p)
         out |= {"tested": int(tested.sum()), "beyond": int(np.sum(t.rejected)), "rejected": bool(np.any(t.rejected))}
-        if tested.any():
-            i = int(np.lexsort((-np.abs(np.where(tested, statistic, 0.0)), np.where(tested, p, np.inf)))[0])
+        extreme = t.details.get("extreme")
+        if extreme is not None:
+            i = int(extreme["index"])
             out |= {"statistic": statistic[i], "p_value": p[i], "labels": [t.labels[i]] if t.labels else []}
         else:
             out |= {"statistic": None, "p_value": None, "labels": []}

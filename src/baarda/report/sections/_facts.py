@@ -55,7 +55,7 @@ def unit_of(analysis: Analysis, row: int) -> str:
     if isinstance(group, Direct):
         i = row - int(a.offsets[g])
         if group.kind == "camera":
-            return a.network.cameras[group.nodes[i]].unit_of(int(group.positions[i]))
+            return str(a.network.cameras[group.nodes[i]].unit_of(int(group.positions[i])))
         if group.kind == "image":
             return "rad" if group.positions[i] >= 3 else a.network.unit
     return str(group.unit)

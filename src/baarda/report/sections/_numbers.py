@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 MISSING = "–"
-_MOST_DECIMALS = 6
+_MOST_DECIMALS = 6  # of a value; beyond, powers of ten
+_NO_MORE = 9  # of a column
 _FINER = {"m": (("mm", 1e3, 1e-2), ("µm", 1e6, 1e-5)), "mm": (("µm", 1e3, 1e-3),), "km": (("m", 1e3, 1e-2),)}
 
 
@@ -98,7 +99,7 @@ def with_sigma(value: float | None, sigma: float | None, digits: int = 2) -> tup
     return f"{value:.{mantissa}e}", f"{sigma:.{digits - 1}e}"
 
 
-def decimals_for(values: ArrayLike, digits: int = 2, most: int = 9) -> int:
+def decimals_for(values: ArrayLike, digits: int = 2, most: int = _NO_MORE) -> int:
     """Return the decimals that show the typical (median) size of some numbers with so many digits.
 
     Examples
@@ -122,8 +123,8 @@ def column(values: ArrayLike, digits: int = 3) -> list[str]:
     ['0.01', '0.50', '–']
     """
     x = np.asarray(values, dtype=float)
-    decimals = decimals_for(x, digits)
-    return [fixed(v, decimals) for v in x.tolist()]
+    decimals = decimals_for(x, digits, _NO_MORE + 1)
+    return [fixed(v, decimals) if decimals <= _NO_MORE else significant(v, digits) for v in x.tolist()]
 
 
 def finer(unit: str, sizes: ArrayLike) -> tuple[str, float]:

@@ -30,26 +30,20 @@ def _short(value: float) -> str:
 
 def _row(test: TestResult, mark: str) -> tuple[str | Cell, ...]:
     """One row: a single test, or the extreme member of a family with the count beyond the limit."""
-    name = test.name.replace("_", " ")
-    if np.ndim(test.statistic):
-        p, statistic = np.asarray(test.p_value, dtype=float), np.asarray(test.statistic)
-        tested, beyond = int(np.isfinite(p).sum()), int(np.sum(test.rejected))
-        if not tested:
-            return (name, test.null + mark, "", "", test.law_name, "", f"{test.alpha:.3g}", "", Cell("not testable", "info"))
-        i = int(np.lexsort((-np.abs(np.nan_to_num(statistic)), np.where(np.isfinite(p), p, np.inf)))[0])
-        label = test.labels[i] if test.labels else f"number {i + 1}"
-        tone = _tone(test, bool(beyond), "warn")
-        decision = Cell(say("{beyond} of {tested} rejected", beyond=beyond, tested=tested), tone)
-        return (
-            name, test.null + mark, f"extreme: {label}", _short(float(statistic[i])), test.law_name, _limits(test), f"{test.alpha:.3g}",
-            probability(float(p[i])), decision,
-        )  # fmt: skip
-    decision = Cell("rejected" if test.rejected else "not rejected", _tone(test, bool(test.rejected), "bad"))
-    of = test.labels[0] if len(test.labels) == 1 else ""
-    return (
-        name, test.null + mark, of, _short(float(test.statistic)), test.law_name, _limits(test), f"{test.alpha:.3g}",
-        probability(float(test.p_value)), decision,
-    )  # fmt: skip
+    head, level = f"{test.name.replace('_', ' ')}\n{test.null}{mark}", f"{test.alpha:.3g}"
+    if not np.ndim(test.statistic):
+        decision = Cell("rejected" if test.rejected else "not rejected", _tone(test, bool(test.rejected), "bad"))
+        label = test.labels[0] if len(test.labels) == 1 else ""
+        numbers = (_short(float(test.statistic)), _limits(test), probability(float(test.p_value)))
+        return (head, decision, *numbers, level, test.law_name, label)
+    p, statistic = np.asarray(test.p_value, dtype=float), np.asarray(test.statistic)
+    tested, beyond = int(np.isfinite(p).sum()), int(np.sum(test.rejected))
+    if not tested:
+        return (head, Cell("not testable", "info"), "", "", "", level, test.law_name, "")
+    i = int(np.lexsort((-np.abs(np.nan_to_num(statistic)), np.where(np.isfinite(p), p, np.inf)))[0])
+    decision = Cell(say("{beyond} of {tested} rejected", beyond=beyond, tested=tested), _tone(test, bool(beyond), "warn"))
+    label = test.labels[i] if test.labels else f"number {i + 1}"
+    return (head, decision, _short(float(statistic[i])), _limits(test), probability(float(p[i])), level, test.law_name, label)
 
 
 def _build(analysis: Analysis) -> list[Block] | None:
@@ -63,15 +57,19 @@ def _build(analysis: Analysis) -> list[Block] | None:
             mark = f" [{notes.setdefault(test.note, len(notes) + 1)}]"
         rows.append(_row(test, mark))
     columns = (
-        Column("test", "", "name, with underscores in result.json", "left"),
-        Column("null hypothesis", "", "what is assumed true until the data contradict; [n] = note below", "left"),
-        Column("of", "", "of a family of equal tests its extreme member", "left"),
-        Column("statistic", "", "the number that is judged"),
-        Column("law", "", "law of the statistic if the null hypothesis is true", "left"),
-        Column("limit", "", "critical value, or the two of a two-sided test"),
-        Column("level", "", "probability of a wrong rejection by one single test"),
-        Column("p", "", "probability of a statistic at least as extreme if the null hypothesis is true"),
+        Column(
+            "test",
+            "",
+            "name (with underscores in result.json) and null hypothesis: what is assumed until the data contradict; [n] = note below",
+            "left",
+        ),
         Column("decision", "", "", "left"),
+        Column("statistic", "", "the number that is judged"),
+        Column("limit", "", "critical value, or the two of a two-sided test"),
+        Column("p", "", "probability of a statistic at least as extreme if the null hypothesis is true"),
+        Column("level", "", "probability of a wrong rejection by one single test"),
+        Column("law", "", "law of the statistic if the null hypothesis is true", "left"),
+        Column("extreme member", "", "of a family of equal tests; statistic and p are its own", "left"),
     )
     families = sum(1 for t in analysis.tests if np.ndim(t.statistic))
     intro = say(

@@ -86,7 +86,7 @@ class DataTable:
     caption : str
     columns : tuple of Column
     rows : tuple of tuples of str or Cell
-        Numbers are already rounded; an empty string is "does not apply".
+        Numbers are already rounded; an empty string is "does not apply". A first cell may have a second line: what the row is about.
     note : str
         What the reader must know, below the table.
     folded : bool

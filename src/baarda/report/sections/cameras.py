@@ -54,7 +54,9 @@ def _parameters(analysis: Analysis) -> DataTable:
                 break
         if len(rows) >= MOST_ROWS:
             break
-    limit = "" if test is None or not isinstance(test.critical, tuple) else say(" (limit {limit} at level {alpha})", limit=fixed(test.critical[1], 2), alpha=f"{test.alpha:.3g}")  # fmt: skip
+    limit = ""
+    if test is not None and isinstance(test.critical, tuple):
+        limit = say(" (limit {limit} at level {alpha})", limit=fixed(test.critical[1], 2), alpha=f"{test.alpha:.3g}")
     columns = (
         *((Column("camera", "", "", "left"),) if several else ()),
         Column("parameter", "", "", "left"),

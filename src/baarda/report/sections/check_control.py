@@ -13,7 +13,7 @@ from baarda.network import AXES
 from baarda.procedures.testing import Analysis
 from baarda.report.sections._facts import MOST_ROWS, first, result_of, scaling
 from baarda.report.sections._numbers import MISSING, decimals_for, finer, fixed, probability, significant
-from baarda.report.sections.base import Block, Cell, Column, DataTable, SectionMaker, say
+from baarda.report.sections.base import Block, Cell, Column, DataTable, SectionMaker, Tone, say
 
 Floats = NDArray[np.float64]
 
@@ -28,26 +28,28 @@ def _by_point(e: Estimates, deviations: Floats) -> dict[str, tuple[Floats, Float
     return out
 
 
-def _tested(test: TestResult | None, label: str) -> tuple[str, str, Cell]:
+def _tested(test: TestResult | None, label: str, grave: Tone) -> tuple[str, str, Cell]:
     if test is None or label not in test.labels:
         return "", "", Cell("")
     i = test.labels.index(label)
     statistic, p = float(np.asarray(test.statistic)[i]), float(np.asarray(test.p_value)[i])
     if not np.isfinite(p):
         return MISSING, MISSING, Cell("uncontrolled", "info")
-    return fixed(statistic, 2), probability(p), Cell("rejected", "bad") if np.asarray(test.rejected)[i] else Cell("agrees", "good")
+    return fixed(statistic, 2), probability(p), Cell("rejected", grave) if np.asarray(test.rejected)[i] else Cell("agrees", "good")
 
 
-def _differences(
-    caption: str, e: Estimates, deviations: Floats, test: TestResult | None, unit: str, words: tuple[str, str], where: str
-) -> DataTable:
+def _differences(analysis: Analysis, kind: str, e: Estimates, deviations: Floats, words: tuple[str, str], where: str) -> DataTable:
+    """Differences of each point with their standard deviations and its test; red only where the joint test of all rejects, too."""
+    test, joint = result_of(analysis, f"{kind}_point"), result_of(analysis, f"{kind}_points")
+    grave: Tone = "bad" if joint is not None and joint.rejected else "warn"
+    caption = "Check points" if kind == "check" else "Weighted control points"
     points = _by_point(e, deviations)
-    told, factor = finer(unit, e.values)
+    told, factor = finer(analysis.adjustment.network.unit, e.values)
     decimals = decimals_for(e.values * factor, 3)
     rows: list[tuple[str | Cell, ...]] = []
     for label, (d, s) in list(points.items())[:MOST_ROWS]:
         numbers = [fixed(float(v) * factor, decimals) for v in (*d, *s)]
-        rows.append((label, *numbers, *_tested(test, label)))
+        rows.append((label, *numbers, *_tested(test, label, grave)))
     columns = (
         Column("point", "", "", "left"),
         *(Column(f"d{axis}", told, words[0]) for axis in AXES),
@@ -98,8 +100,10 @@ def _accuracy(analysis: Analysis, e: Estimates, predicted: Floats) -> DataTable:
         Column("predicted", told, "root mean square of the predicted standard deviations, adjustment and survey"),
         Column("RMSE / predicted", "", "1 = as accurate as predicted"),
     )
-    few = "" if len(d) >= 30 else say("Fewer than 30 check points ({count}): the ASPRS standards (2nd edition) ask for a statement of it.", count=len(d))  # fmt: skip
-    return DataTable("Accuracy from check points", columns, tuple(rows), f"The interval assumes independent normal errors. {few}".strip())
+    note = "The interval assumes independent normal errors."
+    if len(d) < 30:
+        note += " " + say("Fewer than 30 check points ({count}): the ASPRS standards (2nd edition) ask to say so.", count=len(d))
+    return DataTable("Accuracy from check points", columns, tuple(rows), note)
 
 
 def _joint(test: TestResult | None, words: str) -> list[Block]:
@@ -129,7 +133,6 @@ def _build(analysis: Analysis) -> list[Block] | None:
     if not analysis.converged:
         return None
     a = analysis.adjustment
-    unit = a.network.unit
     scale = a.scale(analysis.options.sigma)
     blocks: list[Block] = []
     e: Any = analysis.evidence.check
@@ -142,17 +145,13 @@ def _build(analysis: Analysis) -> list[Block] | None:
         )
         blocks += _joint(result_of(analysis, "check_points"), "check points agree with the survey")
         blocks.append(_accuracy(analysis, e, predicted))
-        blocks.append(_differences("Check points", e, predicted, result_of(analysis, "check_point"), unit, words, "result.json"))
+        blocks.append(_differences(analysis, "check", e, predicted, words, "result.json"))
     e = analysis.evidence.control
     if e is not None and len(e.values):
         words = ("residual v = adjusted - given", say("standard deviation of this residual, {scaling}", scaling=scaling(analysis)))
         deviations = scale * np.sqrt(np.maximum(np.diag(e.cofactors), 0.0))
         blocks += _joint(result_of(analysis, "control_points"), "control coordinates are right")
-        blocks.append(
-            _differences(
-                "Weighted control points", e, deviations, result_of(analysis, "control_point"), unit, words, "tables/observations.csv"
-            )
-        )
+        blocks.append(_differences(analysis, "control", e, deviations, words, "tables/observations.csv"))
     return blocks or None
 
 

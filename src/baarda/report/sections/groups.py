@@ -1,4 +1,4 @@
-"""Statistics of each observation group: does every kind of observation keep what its sigmas promise, and is it controlled?"""
+"""Statistics of each observation group: whether it keeps what its sigmas promise, and whether it is controlled."""
 
 from __future__ import annotations
 
@@ -41,11 +41,15 @@ def _build(analysis: Analysis) -> list[Block] | None:
                 significant(float(np.nanmax(bias)), 3) if known else MISSING,
             )
         )
-    rows.append(
-        ("all", str(total.count), fixed(float(r.sum()), 2), fixed(float(r.min()), 3), fixed(float(r.mean()), 3), "", "", fixed(total.objective, 2),
-         fixed(total.sigma0, 3), _most(analysis.w), _most(analysis.tau), "", "")
-    )  # fmt: skip
+    share = (fixed(float(r.sum()), 2), fixed(float(r.min()), 3), fixed(float(r.mean()), 3))
+    whole = (fixed(total.objective, 2), fixed(total.sigma0, 3), _most(analysis.w), _most(analysis.tau))
+    rows.append(("all", str(total.count), *share, "", "", *whole, "", ""))
     o = analysis.options
+    found = say(
+        "minimal detectable bias: an error found with probability {power} at level {alpha}",
+        power=fixed(o.power, 2),
+        alpha=f"{o.alpha_outlier:g}",
+    )
     columns = (
         Column("group", "", "observations of one kind, then each component of it", "left"),
         Column("n", "", "number of scalar observations"),
@@ -58,9 +62,9 @@ def _build(analysis: Analysis) -> list[Block] | None:
         Column("s0", "", "standard deviation of unit weight of the group, sqrt(v'Pv / Σr); 1 = the a-priori sigmas hold"),
         Column("max |w|", "", "largest residual in its own a-priori standard deviations"),
         Column("max |tau|", "", "largest residual in its own a-posteriori standard deviations"),
-        Column("median MDB", "", say("minimal detectable bias: an error found with probability {power} at level {alpha}", power=fixed(o.power, 2), alpha=f"{o.alpha_outlier:g}")),
+        Column("median MDB", "", found),
         Column("max MDB", "", "the largest error that may stay hidden in one observation of the group"),
-    )  # fmt: skip
+    )
     return [DataTable("Statistics of the observation groups", columns, tuple(rows))]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,12 @@ _WORST = 20
 
 
 def _summary(sigmas: np.ndarray, rays: np.ndarray, unit: str, factor: float) -> DataTable:
-    measures = {"least": np.min, "median": np.median, "root mean square": lambda x: np.sqrt(np.mean(x**2)), "largest": np.max}
+    measures: dict[str, Callable[[np.ndarray], float]] = {
+        "least": np.min,
+        "median": np.median,
+        "root mean square": lambda x: np.sqrt(np.mean(x**2)),
+        "largest": np.max,
+    }
     parts: list[tuple[str, np.ndarray]] = [(f"s{axis}", sigmas[:, k]) for k, axis in enumerate(AXES)] + [("spatial", spatial(sigmas))]
     rows = []
     decimals = decimals_for(sigmas[sigmas > 0.0] * factor, 3)

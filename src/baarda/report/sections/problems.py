@@ -273,7 +273,8 @@ def _law(analysis: Analysis) -> Iterator[Problem]:
 
 
 _CHECKS: tuple[Callable[[Analysis], Iterator[Problem]], ...] = (
-    _global, _gross, _gathered, _survey, _behind, _groups, _systematic, _images, _law, _correlated, _superfluous, _uncontrolled, _weak_points, _few_rays, _aside,
+    _global, _gross, _gathered, _survey, _behind, _groups, _systematic, _images, _law, _correlated, _superfluous,
+    _uncontrolled, _weak_points, _few_rays, _aside,
 )  # fmt: skip
 
 
@@ -297,7 +298,7 @@ def _build(analysis: Analysis) -> list[Block]:
             Column("evidence", "", "", "left"),
             Column("suggestion", "", "", "left"),
         )
-        rows = tuple((Cell(_LABELS[tone], tone), *texts) for tone, *texts in found)
+        rows = tuple((Cell(_LABELS[tone], tone), what, evidence, advice) for tone, what, evidence, advice in found)
         blocks.append(DataTable("Problems and suggestions, the gravest first", columns, rows))
     else:
         blocks.append(Paragraph("No problem was found.", "good"))

@@ -30,7 +30,7 @@ def _build(analysis: Analysis) -> list[Block]:
     software = [("baarda", baarda.__version__), ("python", platform.python_version())]
     software += [(name, version(name)) for name in ("numpy", "scipy", "matplotlib")]
     names = (Column("software", "", "", "left"), Column("version", "", "", "left"))
-    return [DataTable("Settings", columns, tuple([*source, *found, *options])), DataTable("Software", names, tuple(software))]
+    return [DataTable("Settings", columns, (*source, *found, *options)), DataTable("Software", names, tuple(software))]
 
 
 SETTINGS = SectionMaker(140, "settings", "Settings and versions", _build)

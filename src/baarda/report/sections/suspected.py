@@ -27,15 +27,15 @@ def _meanings(analysis: Analysis) -> list[tuple[str, str, str]]:
         others = at_point[points[i]] - 1 if points[i] else 0
         near = in_image[images[i]] - 1 if images[i] else 0
         if ("point", points[i]) in gathered:
-            meaning = "the point is in doubt, not this measurement alone"
+            meaning = "point in doubt"
         elif pairs[(images[i], points[i])] > 1:
-            meaning = "x and y: wrong target or point number?"
+            meaning = "x and y: wrong target?"
         elif ("image", images[i]) in gathered:
-            meaning = "the image is in doubt"
+            meaning = "image in doubt"
         elif not images[i]:
-            meaning = say("check the given {of}", of=components[i])
+            meaning = say("the given {of}", of=components[i])
         else:
-            meaning = "check this measurement"
+            meaning = "this measurement"
         out.append((str(others) if points[i] else "", str(near) if images[i] else "", meaning))
     return out
 
@@ -108,7 +108,13 @@ def _build(analysis: Analysis) -> list[Block] | None:
         Column("p", "", say("probability of a |{name}| as large without gross error", name=name)),
         Column("at point", "", "further observations suspected at the same point"),
         Column("in image", "", "further observations suspected in the same image"),
-        Column("meaning", "", "what to look at first", "left"),
+        Column(
+            "meaning",
+            "",
+            "what to look at first: this measurement alone; the point, where more are suspected there than chance gathers; its target "
+            "or number, where x and y are suspected",
+            "left",
+        ),
     )
     note = say("The first {most} of {count}; all are in tables/observations.csv.", most=_MOST, count=count) if count > _MOST else ""
     return [*blocks, DataTable("Suspected observations, the worst first", columns, tuple(rows), note)]

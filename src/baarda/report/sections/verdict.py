@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
+from baarda.hypotheses.base import TestResult
 from baarda.procedures.testing import Analysis
 from baarda.report.sections._facts import (
     bare,
@@ -81,7 +82,10 @@ def _variance_factor(analysis: Analysis) -> Sentence | None:
     if not test.rejected:
         text = "The variance factor {value} lies within {low}..{high}: the residuals are as large as the a-priori sigmas promise."
     elif ratio > 1.0:
-        text = "The variance factor {value} lies outside {low}..{high}: the residuals are {times} times as large as the a-priori sigmas promise."
+        text = (
+            "The variance factor {value} lies outside {low}..{high}: the residuals are {times} times as large as the a-priori sigmas "
+            "promise."
+        )
     else:
         text = (
             "The variance factor {value} lies outside {low}..{high}: the residuals are only {times} times as large as the a-priori sigmas "
@@ -99,20 +103,28 @@ def _parameters(analysis: Analysis) -> Sentence | None:
     size = np.abs(np.asarray(test.statistic))
     if not weak:
         i = int(np.argmin(size))
+        if len(tested) == 1:
+            template = (
+                "The only additional camera parameter, {name}, differs significantly from zero at level {alpha} (|t| = {t}, limit {limit})."
+            )
+        else:
+            template = (
+                "All {count} additional camera parameters differ significantly from zero at level {alpha} (smallest |t| = {t} for {name}, "
+                "limit {limit})."
+            )
         text = say(
-            "All {count} additional camera parameters differ significantly from zero at level {alpha} (smallest |t| = {t} for {name}, "
-            "limit {limit}).",
+            template,
             t=significant(size[i], 3),
             name=bare(tested[i], analysis),
             **fields,
         )
         return Sentence("Camera model", text, "good", "cameras")
-    shown = ", ".join(weak[:6]) + (f" and {len(weak) - 6} more" if len(weak) > 6 else "")
     text = say(
-        "{weak} of {count} additional camera parameters do not differ significantly from zero at level {alpha} (|t| below {limit}): "
-        "{names}; the model may do without them.",
+        "{weak} of {count} additional camera parameters {verb} not differ significantly from zero at level {alpha} (|t| below {limit}): "
+        "{names}; the model may do without.",
         weak=len(weak),
-        names=shown,
+        verb="does" if len(weak) == 1 else "do",
+        names=names(weak, 6),
         **fields,
     )
     return Sentence("Camera model", text, "warn", "cameras")
@@ -178,14 +190,13 @@ def _hidden(analysis: Analysis) -> Sentence | None:
     if not np.isfinite(values).any():
         return Sentence("Reliability", say("No {what} is controlled by others: gross errors cannot be found.", what=what), "bad", "groups")
     at = int(rows[int(np.nanargmax(values))])
-    shown = column([float(np.nanmedian(values)), float(np.nanmax(values))], 2)
     text = say(
-        "A gross error in an {what} is found with probability {power} from {median} {unit} on (median); the least controlled one, "
-        "{label}, may hide up to {most} {unit}.",
+        "A gross error in an {what} is found with probability {power} from {median} {unit} on (median, by the a-priori sigmas); the "
+        "least controlled one, {label}, may hide up to {most} {unit}.",
         what=what,
         power=fixed(analysis.options.power, 2),
-        median=shown[0],
-        most=shown[1],
+        median=significant(float(np.nanmedian(values)), 2),
+        most=significant(float(np.nanmax(values)), 2),
         unit=unit_of(analysis, at),
         label=label_of(analysis, at),
     )
@@ -222,57 +233,72 @@ def _precision(analysis: Analysis) -> Sentence | None:
 
 
 def _points(analysis: Analysis) -> Sentence | None:
-    parts, tone = [], "good"
-    e = analysis.evidence.check
-    check, each = result_of(analysis, "check_points"), result_of(analysis, "check_point")
-    if check is not None and e is not None:
-        count = len(set(e.groups))
-        beyond = [] if each is None else [n for n, r in zip(each.labels, np.asarray(each.rejected), strict=True) if r]
-        rms = float(np.sqrt(np.sum(np.square(e.values)) / count))
-        unit, factor = finer(analysis.adjustment.network.unit, [rms])
-        template = (
-            "{points} from the survey by more than the predicted precision allows (T = {t}, limit {limit}; RMSE {rms} {unit}; beyond: "
-            "{names})."
-            if check.rejected or beyond
-            else "{points} from the survey by no more than the predicted precision allows (T = {t}, limit {limit}; RMSE {rms} {unit})."
-        )
-        parts.append(
-            say(
-                template,
-                points=plural(count, "check point differs", "check points differ"),
-                t=fixed(float(check.statistic), 2),
-                limit=fixed(_upper(check.critical), 2),
-                rms=significant(rms * factor, 3),
-                unit=unit,
-                names=", ".join(beyond[:5]) + (" ..." if len(beyond) > 5 else "") if beyond else "none singly",
-            )
-        )
-        tone = "bad" if check.rejected or beyond else tone
-    control, each = result_of(analysis, "control_points"), result_of(analysis, "control_point")
-    if control is not None and each is not None:
-        count = len(each.labels)
-        beyond = int(np.sum(each.rejected))
-        template = (
-            "The weighted control contradicts its sigmas (T = {t}, limit {limit}): {beyond} of {count} points are rejected, the worst "
-            "is {name}."
-            if control.rejected
-            else "The weighted control agrees with its sigmas (T = {t}, limit {limit}; {beyond} of {count} points rejected singly)."
-        )
-        parts.append(
-            say(
-                template,
-                t=fixed(float(control.statistic), 2),
-                limit=fixed(_upper(control.critical), 2),
-                beyond=beyond,
-                count=count,
-                name=each.details.get("extreme", {}).get("label", ""),
-            )
-        )
-        tone = "bad" if control.rejected else tone
-    if not parts:
+    """Judge by the joint tests; single points count where more of them are rejected than chance rejects."""
+    said = [part for part in (_check(analysis), _control(analysis)) if part is not None]
+    if not said:
         return None
-    link = "check-control"
-    return Sentence("Control and check points", " ".join(parts), "bad" if tone == "bad" else "good", link)
+    tones = [tone for _, tone in said]
+    tone: Tone = "bad" if "bad" in tones else "warn" if "warn" in tones else "good"
+    return Sentence("Control and check points", " ".join(text for text, _ in said), tone, "check-control")
+
+
+def _judged(joint: TestResult, each: TestResult) -> tuple[Tone, list[str], bool]:
+    """Return the tone, the points rejected singly, the worst first, and whether they are more than chance rejects (level 0.01)."""
+    p = np.asarray(each.p_value, dtype=float)
+    order = [int(i) for i in np.argsort(p, kind="stable") if np.asarray(each.rejected)[i]]
+    many = len(order) > float(stats.binom.ppf(0.99, int(np.isfinite(p).sum()), each.alpha))
+    return "bad" if joint.rejected else "warn" if many else "good", [each.labels[i] for i in order], many
+
+
+def _check(analysis: Analysis) -> tuple[str, Tone] | None:
+    e, joint, each = analysis.evidence.check, result_of(analysis, "check_points"), result_of(analysis, "check_point")
+    if e is None or joint is None or each is None:
+        return None
+    tone, wrong, _ = _judged(joint, each)
+    count = len(each.labels)
+    rms = float(np.sqrt(np.sum(np.square(e.values)) / count))
+    unit, factor = finer(analysis.adjustment.network.unit, [rms])
+    template = (
+        "{points} from the survey by more than the predicted precision allows (T = {t}, limit {limit}; RMSE {rms} {unit}; singly rejected: "
+        "{names})."
+        if joint.rejected
+        else "{points} from the survey by no more than the predicted precision allows (T = {t}, limit {limit}; RMSE {rms} {unit}; singly "
+        "rejected: {names})."
+    )
+    text = say(
+        template,
+        points=plural(count, "check point differs", "check points differ"),
+        t=fixed(float(joint.statistic), 2),
+        limit=fixed(_upper(joint.critical), 2),
+        rms=significant(rms * factor, 3),
+        unit=unit,
+        names=names(wrong, 5) or "none",
+    )
+    return text, tone
+
+
+def _control(analysis: Analysis) -> tuple[str, Tone] | None:
+    joint, each = result_of(analysis, "control_points"), result_of(analysis, "control_point")
+    if joint is None or each is None:
+        return None
+    tone, wrong, many = _judged(joint, each)
+    fields = {
+        "t": fixed(float(joint.statistic), 2),
+        "limit": fixed(_upper(joint.critical), 2),
+        "wrong": len(wrong),
+        "count": len(each.labels),
+    }
+    if joint.rejected and wrong:
+        template = (
+            "The weighted control contradicts its sigmas (T = {t}, limit {limit}): {wrong} of {count} points are rejected singly, the "
+            "worst is {worst}."
+        )
+    elif joint.rejected:
+        template = "The weighted control contradicts its sigmas (T = {t}, limit {limit}), though none of {count} points singly."
+    else:
+        template = "The weighted control agrees with its sigmas (T = {t}, limit {limit}; {wrong} of {count} points rejected singly{more})."
+    more = ", more than chance rejects" if many else ""
+    return say(template, worst=wrong[0] if wrong else "", more=more, **fields), tone
 
 
 def _upper(critical: float | tuple[float, float]) -> float:
@@ -293,11 +319,14 @@ def _law(analysis: Analysis) -> Sentence | None:
     }
     tone: Tone = "warn" if normal.rejected else "good"
     if not normal.rejected:
-        text = "The standardised residuals follow the normal law (chi-square {chi}, limit {limit}, p {p})."
+        text = "The standardised residuals do not contradict the normal law (chi-square {chi}, limit {limit}, p {p})."
         if best.law != "normal":
             text += " The {best} has the better AIC, but not by enough to reject the normal."
     elif best.law == "normal":
-        text = "The standardised residuals do not follow the normal law (chi-square {chi}, limit {limit}, p {p}); no other law tried fits better."
+        text = (
+            "The standardised residuals do not follow the normal law (chi-square {chi}, limit {limit}, p {p}); no other law tried fits "
+            "better."
+        )
     else:
         text = (
             "The standardised residuals do not follow the normal law (chi-square {chi}, limit {limit}, p {p}); of the laws tried the "

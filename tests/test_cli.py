@@ -1,0 +1,221 @@
+"""The command line as a user meets it: exit codes, streams, one clear message, nothing half-written."""
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+
+def run(*arguments, cwd=None, **options):
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent / "src"), "NO_COLOR": "1"}
+    command = [sys.executable, "-m", "baarda", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, encoding="utf-8", cwd=cwd, env=environment, check=False, **options)
+
+
+@pytest.fixture(scope="module")
+def two_demos(tmp_path_factory):
+    """The demo, twice, from a folder without the sources."""
+    folder = tmp_path_factory.mktemp("demo")
+    first, second = run("demo", "--out", "one", cwd=folder), run("demo", "--out", "two", "--quiet", cwd=folder)
+    return folder, first, second
+
+
+def test_demo_writes_the_folder_of_the_contract(two_demos):
+    folder, first, _ = two_demos
+    assert first.returncode == 0, first.stderr
+    assert {p.name for p in (folder / "one").iterdir()} == {"report.html", "result.json", "run.json", "tables", "figures", "project"}
+    assert {p.name for p in (folder / "one" / "tables").iterdir()} == {"observations.csv", "points.csv", "images.csv", "unknowns.csv"}
+    assert "4148 observations" in first.stdout
+    assert "v'Pv" in first.stderr
+    assert "v'Pv" not in first.stdout
+
+
+def test_demo_numbers(two_demos):
+    result = json.loads((two_demos[0] / "one" / "result.json").read_text())
+    c = result["counts"]
+    assert (c["observations"], c["unknowns"], c["redundancy"], c["datum_defect"]) == (4148, 423, 3725, 0)
+    assert (c["images"], c["object_points"], c["control_points"], c["image_observations"]) == (21, 100, 4, 4148)
+    assert result["sigma0"]["aposteriori"] == pytest.approx(1.61480435, abs=5e-9)
+    assert result["schema"] == "baarda.result/1"
+    assert result["status"] == "converged"
+    names = {t["name"] for t in result["tests"]}
+    assert names >= {"global_variance_factor", "mean_of_residuals", "skewness_of_residuals", "kurtosis_of_residuals", "bartlett_images"}
+    assert names >= {"variance_per_image", "all_additional_parameters", "additional_parameter", "data_snooping"}
+    assert [law["law"] for law in result["laws"]] == ["normal", "radico", "lineo", "modulated_normal"]
+    assert len(result["outliers"]) == 45
+    assert (result["outliers"][0]["image"], result["outliers"][0]["point"]) == ("19", "8")
+    pair = next(p for p in result["correlations"] if {p["a"], p["b"]} == {"camera 1: K2", "camera 1: K3"})
+    assert pair["value"] == pytest.approx(-0.9786, abs=5e-5)
+
+
+def test_two_runs_give_the_same_bytes(two_demos):
+    folder, _, second = two_demos
+    assert second.returncode == 0
+    assert second.stdout == second.stderr == ""
+    files = sorted(p.relative_to(folder / "one") for p in (folder / "one").rglob("*") if p.is_file())
+    for name in files:
+        if name.name != "run.json":
+            assert (folder / "one" / name).read_bytes() == (folder / "two" / name).read_bytes(), name
+
+
+def test_the_adjusted_project_is_read_again(two_demos):
+    folder = two_demos[0]
+    again = run("adjust", folder / "one" / "project", "--json", "--quiet")
+    assert again.returncode == 0, again.stderr
+    result = json.loads(again.stdout)
+    assert result["sigma0"]["aposteriori"] == pytest.approx(1.61480435, abs=5e-9)
+    assert result["counts"]["redundancy"] == 3725
+    assert not (Path.cwd() / "baarda-out").exists()
+
+
+def test_json_has_no_nan(two_demos):
+    text = (two_demos[0] / "one" / "result.json").read_text()
+
+    def refuse(value):
+        raise AssertionError(value)
+
+    json.loads(text, parse_constant=refuse)
+
+
+def test_strict_gate(tmp_path):
+    done = run("demo", "--out", tmp_path / "r", "--strict", "--quiet")
+    assert done.returncode == 1
+    assert "global_variance_factor" in done.stderr
+    assert (tmp_path / "r" / "result.json").is_file()
+
+
+def test_not_converged_writes_a_folder_without_tests(camcal, tmp_path, monkeypatch):
+    from typer.testing import CliRunner
+
+    from baarda.adjustment import solve
+    from baarda.cli import app
+
+    usual = solve.Settings.of
+    monkeypatch.setattr(solve.Settings, "of", staticmethod(lambda n, o: usual(n, {**o, "iterations": 2})))
+    done = CliRunner().invoke(app, ["adjust", str(camcal), "--out", str(tmp_path / "r")])
+    assert done.exit_code == 3
+    result = json.loads((tmp_path / "r" / "result.json").read_text())
+    assert result["status"] == "not_converged"
+    assert result["tests"] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["adjust", "missing.txt"], 2, "no such file"),
+        (["adjust"], 2, "SOURCE"),
+        (["adjust", "empty.txt"], 2, "empty"),
+        (["adjust", "strange.txt"], 2, "no known format"),
+        (["adjust", "strange.txt", "--format", "colmap"], 2, "strange.txt"),
+        (["adjust", "strange.txt", "--format", "nothing"], 2, "unknown format"),
+        (["demo", "--datum", "x"], 2, "datum"),
+        (["demo", "--solver", "qr", "--out", "o"], 2, "solver"),
+        (["demo", "--alpha", "2", "--out", "o"], 2, "alpha"),
+        (["demo", "--tables", "xml", "--out", "o"], 2, "tables"),
+        (["demo", "--sigma", "both", "--out", "o"], 2, "sigma"),
+        (["nonsense"], 2, "nonsense"),
+        (["demo", "--out", "strange.txt"], 4, "not a result folder"),
+        (["demo", "--out", "/proc/nothing/here"], 4, "cannot write"),
+    ],
+)
+def test_failures_are_one_message(tmp_path, arguments, code, words):
+    (tmp_path / "empty.txt").touch()
+    (tmp_path / "strange.txt").write_text("hello\n")
+    before = sorted(tmp_path.rglob("*"))
+    done = run(*arguments, cwd=tmp_path)
+    assert done.returncode == code, done.stderr
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    assert sorted(tmp_path.rglob("*")) == before  # nothing half-written
+
+
+def test_singular_network_leaves_no_folder(data, tmp_path):
+    done = run("adjust", data("dbat_camcal") / "pm" / "camcal-pmexport.txt", "--out", "r", cwd=tmp_path)
+    assert done.returncode == 3
+    assert "datum defect 7" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_of_someone_else_is_not_replaced(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("years of work")
+    done = run("demo", "--out", "mine", "--quiet", cwd=tmp_path)
+    assert done.returncode == 4
+    assert (tmp_path / "mine" / "thesis.txt").read_text() == "years of work"
+    assert [p.name for p in tmp_path.iterdir()] == ["mine"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
+def test_interruption_leaves_nothing(tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent / "src")}
+    command = [sys.executable, "-m", "baarda", "demo", "--out", "r"]
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True) as process:
+        for line in process.stderr:  # interrupt while the adjustment runs
+            if line.startswith("iteration"):
+                break
+        process.send_signal(signal.SIGINT)
+        rest = process.stderr.read()
+    assert process.returncode == 130
+    assert "interrupted" in rest
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(os.name == "nt" or not shutil.which("bash"), reason="POSIX limits")
+def test_a_full_disk_leaves_nothing(tmp_path):
+    """A limit on the size of files stands for the full disk: writing fails in the middle."""
+
+    def limit():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+
+    done = run("demo", "--out", "r", "--quiet", cwd=tmp_path, preexec_fn=limit)
+    assert done.returncode == 4, done.stderr
+    assert "cannot write" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_imports_nothing_heavy():
+    code = "import sys; sys.argv=['baarda','--help']\nfrom baarda.cli import main\ntry:\n  main()\nfinally:\n  print(sorted(sys.modules))"
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent / "src")}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    modules = done.stdout[done.stdout.rindex("[") :]
+    assert "'typer'" in modules
+    for heavy in ("numpy", "scipy", "matplotlib", "numba", "pydantic", "jinja2"):
+        assert f"'{heavy}'" not in modules, heavy
+
+
+def test_importing_baarda_is_cheap():
+    code = "import sys, baarda; assert not {'numpy', 'scipy'} & set(sys.modules); print(baarda.__version__, len(dir(baarda)))"
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent / "src")}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("verb", ["formats", "cameras", "laws", "tests"])
+def test_lists(verb):
+    done = run(verb)
+    assert done.returncode == 0
+    assert len(done.stdout.splitlines()) >= 3
+    assert all(len(line.split(maxsplit=1)) == 2 for line in done.stdout.splitlines())
+
+
+def test_version():
+    assert run("--version").stdout.startswith("baarda 0.")
+    assert time.time() > 0
+
+
+def test_convert_to_the_project_and_back(data, tmp_path):
+    done = run("convert", data("dbat_sxb") / "sxb.xml", "--to", "project", "--out", tmp_path / "p")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(run("adjust", tmp_path / "p", "--json", "--quiet").stdout)
+    assert result["sigma0"]["aposteriori"] == pytest.approx(1.1785983161860711, rel=1e-9)
+    points = {row["point"]: row for row in result["check_points"]}
+    assert points["351"]["dz"] == pytest.approx(-0.459, abs=5e-4)
+    assert points["410"]["p_value"] is not None
