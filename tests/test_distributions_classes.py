@@ -52,7 +52,11 @@ def test_edges() -> None:
     b = equal_probability_edges(law("radico")(loc=2.0, scale=3.0), 7)
     assert probabilities(law("radico")(loc=2.0, scale=3.0), b) == pytest.approx(1 / 7)
     assert equal_width_edges([3.0, 1.0, 2.0], 4) == pytest.approx([1, 1.5, 2, 2.5, 3])
-    for bad in (lambda: equal_width_edges([1.0, 1.0], 3), lambda: equal_probability_edges(law("normal")(), 1), lambda: equal_width_edges([1.0, 2.0], 1)):
+    for bad in (
+        lambda: equal_width_edges([1.0, 1.0], 3),
+        lambda: equal_probability_edges(law("normal")(), 1),
+        lambda: equal_width_edges([1.0, 2.0], 1),
+    ):
         with pytest.raises(UsageError):
             bad()
     assert usual_number_of_classes(10) == 2
@@ -75,7 +79,9 @@ def test_merging_leaves_no_small_class() -> None:
         merge_small([0, 1, 2], [1, 1], [1.0, 1.0])
 
 
-@pytest.mark.parametrize(("name", "rule"), [(n, r) for n in ("normal", "laplace", "modulated_normal", "student") for r in ("minimum_chi2", "grouped_likelihood")])
+@pytest.mark.parametrize(
+    ("name", "rule"), [(n, r) for n in ("normal", "laplace", "modulated_normal", "student") for r in ("minimum_chi2", "grouped_likelihood")]
+)
 def test_exact_counts_give_back_the_law(name: str, rule: str) -> None:
     truth = law(name)(**({"a": 0.4} if name == "modulated_normal" else {}), loc=0.3, scale=1.7)
     b = np.linspace(-5.0, 5.0, 15)

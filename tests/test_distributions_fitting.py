@@ -182,6 +182,7 @@ def test_condensed_data_merge() -> None:
         condense(x) + condense(x, 1.0)
     with pytest.raises(UsageError):
         condense([1.0, np.inf])
+    assert fit(parts, loc=0.0).parameters == pytest.approx(fit(x, loc=0.0).parameters, rel=1e-9)
     zeros = condense([0.0, -0.0, 1.0])
     assert zeros.n == 3
     assert np.sum(zeros.points()[1]) == 3
@@ -321,7 +322,9 @@ def test_scipy_procedures_accept_them() -> None:
     assert stats.kstest(x, D.modulated_normal.cdf, args=(0.5, 0, 1)).pvalue > 0.001
     result = stats.goodness_of_fit(D.radico, x, statistic="ad", n_mc_samples=19, rng=np.random.default_rng(0))
     assert 0 < result.pvalue <= 1
-    result = stats.goodness_of_fit(D.modulated_normal, x, known_params={"loc": 0.0}, statistic="ks", n_mc_samples=9, rng=np.random.default_rng(0))
+    result = stats.goodness_of_fit(
+        D.modulated_normal, x, known_params={"loc": 0.0}, statistic="ks", n_mc_samples=9, rng=np.random.default_rng(0)
+    )
     assert result.fit_result.params.loc == 0.0
     found = stats.fit(D.modulated_normal, x, {"a": (-0.2, 20), "loc": (-2, 2), "scale": (0.3, 4)})
     assert found.success

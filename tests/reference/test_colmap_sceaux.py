@@ -74,5 +74,3 @@ def test_dense_and_block_agree(network, images, points):
     assert block.redundancy_numbers.sum() == pytest.approx(block.redundancy, rel=1e-9)
     np.testing.assert_allclose(block.points["sX"], dense.points["sX"], rtol=1e-6)
     assert block.objective == pytest.approx(dense.objective, rel=1e-10)
-
-

@@ -25,7 +25,9 @@ def columns_of(cls: type[Distribution], shapes: tuple[np.ndarray, ...], n: int, 
     return cls._rvs(rng, (n, REPLICAS), *shapes)
 
 
-def statistics(member: Law, x: np.ndarray, start: Distribution, given: dict[str, float]) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, ...]]:
+def statistics(
+    member: Law, x: np.ndarray, start: Distribution, given: dict[str, float]
+) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, ...]]:
     x = np.sort(x, axis=0)
     p, _ = refit_columns(member, x, start, given)
     cls = member.distribution
@@ -42,7 +44,14 @@ def check(drawn: np.ndarray, bootstrapped: np.ndarray, what: str) -> None:
         assert abs(z) <= 4, f"{what}: size {size:.4f} at {level}"
 
 
-CASES = [("normal", {}, 30), ("radico", {}, 30), ("lineo", {"loc": 0.0}, 60), ("laplace", {}, 25), ("logistic", {}, 40), ("modulated_normal", {"loc": 0.0}, 120)]
+CASES = [
+    ("normal", {}, 30),
+    ("radico", {}, 30),
+    ("lineo", {"loc": 0.0}, 60),
+    ("laplace", {}, 25),
+    ("logistic", {}, 40),
+    ("modulated_normal", {"loc": 0.0}, 120),
+]
 
 
 @pytest.mark.parametrize(("name", "given", "n"), CASES)
@@ -115,7 +124,7 @@ def test_standard_errors_and_profile_intervals_cover() -> None:
     truth = law("modulated_normal")(a=1.0, scale=2.0)
     rng = np.random.default_rng(8)
     inside = scales = 0
-    count = 300
+    count = 150
     for _ in range(count):
         x = truth.rvs(800, rng)
         low, high = profile_interval(x, loc=0.0)

@@ -12,13 +12,14 @@ from scipy import optimize, special
 
 from baarda.distributions import law as find_law
 from baarda.distributions.base import Distribution, Floats, Law, Shape
-from baarda.distributions.condensed import condense
+from baarda.distributions.condensed import Condensed, condense
 from baarda.distributions.histogram import Histogram
 from baarda.errors import UsageError
 
 Rule = Literal["maximum_likelihood", "moments", "minimum_chi2", "grouped_likelihood"]
 CONDENSE_FROM = 20_000
 _SMALL = 200
+_LARGE = 5000
 FREE_CENTRE_LOWER = -0.25  # below, the location information of the modulated normal is infinite (a <= -1/2: the likelihood unbounded)
 
 
@@ -122,7 +123,7 @@ class Fit:
 
 
 def fit(
-    values: ArrayLike,
+    values: ArrayLike | Condensed,
     law: str | Law = "modulated_normal",
     *,
     rule: Rule = "maximum_likelihood",
@@ -138,7 +139,7 @@ def fit(
 
     Parameters
     ----------
-    values : (n,) array
+    values : (n,) array or Condensed
         Residuals, or residuals divided by their standard deviations.
     law : str or Law
         The law, for instance ``"normal"``, ``"radico"``, ``"modulated_normal"``.
@@ -183,6 +184,8 @@ def fit(
     True
     """
     member = find_law(law) if isinstance(law, str) else law
+    if isinstance(values, Condensed):
+        return _fit_sample(member, Sample.of_condensed(values), rule, loc, scale, shapes, lower_a)
     x = check_values(values)
     if rule in ("minimum_chi2", "grouped_likelihood"):
         from baarda.distributions.class_fitting import fit_classes
@@ -193,22 +196,32 @@ def fit(
         b = check_edges(edges)
         counts = count(x, b, ends)
         return fit_classes(counts, b, member, rule=rule, loc=loc, scale=scale, shapes=shapes, ends=ends, alpha=alpha)
+    return _fit_sample(member, Sample.of(x, float(np.mean(x)) if loc is None else float(loc)), rule, loc, scale, shapes, lower_a)
+
+
+def _fit_sample(
+    member: Law,
+    sample: Sample,
+    rule: Rule,
+    loc: float | None,
+    scale: float | None,
+    shapes: Mapping[str, float] | None,
+    lower_a: float | None,
+) -> Fit:
     given = given_values(member, loc, scale, shapes)
     free = tuple(name for name in member.parameter_names if name not in given)
-    if x.size <= len(free):
-        raise UsageError(f"{x.size} values do not suffice to fit {len(free)} parameters ({', '.join(free)})")
-    if free and not x.max() > x.min():
+    if sample.n <= len(free):
+        raise UsageError(f"{sample.n} values do not suffice to fit {len(free)} parameters ({', '.join(free)})")
+    if free and not np.ptp(sample.points) > 0.0:
         raise UsageError("all values are equal: no law can be fitted")
-    centre = given.get("loc", float(np.mean(x)))
-    sample = Sample.of(x, centre)
     if rule == "moments":
         found, bounds = _moment_estimates(member, sample, given)
         distribution = member.with_values(found)
         return Fit(
-            member.name, distribution, rule, free, x.size, sample.log_likelihood(distribution), dict.fromkeys(free), at_bounds=bounds
+            member.name, distribution, rule, free, sample.n, sample.log_likelihood(distribution), dict.fromkeys(free), at_bounds=bounds
         )
     if rule != "maximum_likelihood":
-        raise UsageError(f"no rule named {rule!r}")
+        raise UsageError(f"no rule named {rule!r} for these values")
     return maximise(member, sample, given, free, lower_a)
 
 
@@ -248,11 +261,16 @@ class Sample:
     @classmethod
     def of(cls, values: Floats, centre: float) -> Sample:
         """Take values as they are, or condensed when they are many."""
-        if values.size < CONDENSE_FROM:
-            points, weights = values - centre, None
-        else:
-            points, weights = condense(values, centre).points()
-        return cls(points, weights, centre, values.size, bool(np.any(points == 0.0)))
+        if values.size >= CONDENSE_FROM:
+            return cls.of_condensed(condense(values, centre))
+        points = values - centre
+        return cls(points, None, centre, values.size, bool(np.any(points == 0.0)))
+
+    @classmethod
+    def of_condensed(cls, condensed: Condensed) -> Sample:
+        """Take condensed values."""
+        points, weights = condensed.points()
+        return cls(points, weights, condensed.centre, condensed.n, bool(np.any(points == 0.0)))
 
     def sum(self, terms: Floats) -> float:
         """Weighted sum of a term per point."""
@@ -418,8 +436,8 @@ class _Problem:
             out[i] = (self.cost(up)[1] - self.cost(down)[1]) / (up[i] - down[i])
         return 0.5 * (out + out.T)
 
-    def minimise(self, start: Floats) -> tuple[Floats, float]:
-        """Quasi-Newton within the bounds, then Newton steps on the coordinates that are inside."""
+    def minimise(self, start: Floats, *, polish: bool = True) -> tuple[Floats, float]:
+        """Quasi-Newton within the bounds, then (to polish) Newton steps on the coordinates that are inside."""
         box = self.bounds()
         start = np.clip(start, [b[0] for b in box], [b[1] for b in box])
         result = optimize.minimize(
@@ -427,7 +445,7 @@ class _Problem:
         )
         theta, best = np.asarray(result.x, dtype=float), float(result.fun)
         inside = np.array([b[0] < t < b[1] for b, t in zip(box, theta, strict=True)])
-        for _ in range(4):
+        for _ in range(4 if polish else 0):
             if not inside.any():
                 break
             slope = self.cost(theta)[1][inside]
@@ -530,7 +548,8 @@ def _best_of_starts(problem: _Problem) -> tuple[Floats, float]:
         theta = problem.coordinates(values)
         starts.append((problem.cost(theta)[0], tuple(theta)))
     starts.sort()
-    results = [problem.minimise(np.array(theta)) for _, theta in starts[: 2 if len(starts) > 1 else 1]]
+    # in small samples the likelihood may have a second maximum in the shape
+    results = [problem.minimise(np.array(theta)) for _, theta in starts[: 2 if sample.n < _LARGE else 1]]
     return min(results, key=lambda r: r[1])
 
 
@@ -651,7 +670,7 @@ def profile_interval(
 
     def excess(u: float) -> float:
         rest = replace(full, given=dict(given) | {name: float(shape.from_unit(u))}, free=tuple(f for f in full.free if f != name))
-        value = rest.minimise(np.delete(centre, i))[1] if rest.free else rest.cost(np.zeros(0))[0]
+        value = rest.minimise(np.delete(centre, i), polish=False)[1] if rest.free else rest.cost(np.zeros(0))[0]
         return value - best - drop
 
     ends = [_crossing(excess, float(centre[i]), bound) for bound in (low, high)]

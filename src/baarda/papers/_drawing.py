@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Sequence
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -105,8 +106,6 @@ def _own(svg: str, name: str) -> str:
 
 def document(svg: str, title: str, alt: str) -> str:
     """Return an ``<svg>`` element as a file that says what it shows."""
-    from html import escape
-
     head, rest = svg.split(">", 1)
     said = f"<title>{escape(title)}</title>\n<desc>{escape(alt)}</desc>"
     return f'<?xml version="1.0" encoding="utf-8"?>\n{head} role="img" aria-label="{escape(alt)}">\n{said}{rest}'
@@ -114,10 +113,9 @@ def document(svg: str, title: str, alt: str) -> str:
 
 def inline(svg: str, alt: str) -> str:
     """Return an ``<svg>`` element for a page, whose neutral colours it takes."""
-    from html import escape
-
     svg = re.sub(r"<defs>\s*<style type=\"text/css\">[^<]*</style>\s*</defs>\s*", "", svg, count=1)
     for colour, variable in ((INK, "ink"), (MUTED, "muted"), (LINE, "line")):
         svg = svg.replace(f": {colour}", f": var(--{variable})")
     head, rest = svg.split(">", 1)
-    return f'{re.sub(r" (width|height|xmlns(:xlink)?)=" + chr(34) + "[^" + chr(34) + "]*" + chr(34), "", head)} role="img" aria-label="{escape(alt)}">{rest}'
+    head = re.sub(r' (?:width|height|xmlns|xmlns:xlink)="[^"]*"', "", head)
+    return f'{head} role="img" aria-label="{escape(alt)}">{rest}'

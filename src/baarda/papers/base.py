@@ -70,9 +70,13 @@ class Row:
     @property
     def agrees(self) -> bool:
         """Whether ours, rounded as the paper rounds, is the printed value; True where nothing is printed."""
-        if self.difference is None:
-            return self.printed is None or self.printed == self.ours
-        return abs(self.difference) <= 0.5 * 10.0**-self.decimals * (1.0 + 1e-9)
+        return _agree(self.printed, self.ours, self.decimals)
+
+
+def _agree(printed: Value | None, ours: Value, decimals: int) -> bool:
+    if printed is None or isinstance(printed, str) or isinstance(ours, str):
+        return printed is None or printed == ours
+    return abs(ours - printed) <= 0.5 * 10.0**-decimals * (1.0 + 1e-9)
 
 
 def row(labels: tuple[str, ...], printed: Value | None, ours: Value, decimals: int = 2, reason: Reason | None = None, remark: str = "") -> Row:
@@ -84,17 +88,7 @@ def row(labels: tuple[str, ...], printed: Value | None, ours: Value, decimals: i
     >>> row(("lineo",), 12.01, 14.041, reason=old).reason == old, row(("lineo",), 14.04, 14.041, reason=old).reason
     (True, None)
     """
-    probe = Row(labels, None, ours, decimals)
-    agrees = _as_printed(probe, printed).agrees
-    return Row(labels, printed, ours, decimals, None if agrees else reason, remark)
-
-
-def _as_printed(probe: Row, printed: Value | None) -> Row:
-    """Return the row with a printed value, unchecked."""
-    made = object.__new__(Row)
-    for name, value in {**vars(probe), "printed": printed}.items():
-        object.__setattr__(made, name, value)
-    return made
+    return Row(labels, printed, ours, decimals, None if _agree(printed, ours, decimals) else reason, remark)
 
 
 @dataclass(frozen=True)

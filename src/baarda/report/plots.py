@@ -94,7 +94,7 @@ def drawn(name: str, size: tuple[float, float], draw: Callable[[Any], None]) -> 
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasSVG(figure)
         draw(figure)
-        figure.savefig(out, format="svg", dpi=150, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+        figure.savefig(out, format="svg", dpi=130, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     # Names come from strangers: nothing that XML forbids, nothing that turns the direction of writing.
     return _own("".join(c if c.isprintable() or c == "\n" else "\ufffd" for c in out.getvalue()), name)
 
@@ -384,7 +384,7 @@ def plan(
     # Long coordinates are told as an offset in the axis label.
     origin = np.where(np.abs(low) > 50.0 * np.maximum(high - low, 1e-12), np.floor(low / 100.0) * 100.0, 0.0)
     reach = 0.07 * float((high - low).max() or 1.0)
-    marks = {"tie": ("o", 9.0), "control": ("^", 34.0), "check": ("D", 26.0)}
+    marks = {"tie": ("o", 9.0 if len(points) <= 1000 else 4.0), "control": ("^", 34.0), "check": ("D", 26.0)}
     kinds = np.asarray(roles)
     spread = np.maximum(high - low, 1e-9)
     ratio = [float(np.clip(spread[k] / spread[0], 0.18, 1.6)) for k in (1, 2)]

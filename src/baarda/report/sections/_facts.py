@@ -62,9 +62,13 @@ def unit_of(analysis: Analysis, row: int) -> str:
 
 
 def label_of(analysis: Analysis, row: int) -> str:
-    """Return the name of a scalar observation: image, point and component, or what is observed directly."""
-    test = result_of(analysis, "data_snooping")
-    return test.labels[row] if test is not None and test.labels else f"observation {row + 1}"
+    """Return the name of a scalar observation: image, point and component; its group where it is no image coordinate."""
+    a, table = analysis.adjustment, analysis.observations
+    g = int(np.searchsorted(a.offsets, row, side="right")) - 1
+    image, point = table["image"][row], table["point"][row]
+    head = "" if isinstance(a.groups[g], ImagePoints) else f"{table['group'][row]},"
+    parts = (head, f"image {image}" if image else "", f"point {point}" if point else "", str(table["component"][row]))
+    return " ".join(part for part in parts if part)
 
 
 def bare(name: str, analysis: Analysis) -> str:

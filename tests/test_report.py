@@ -1,0 +1,365 @@
+"""The report: what it says of real blocks, and that names from strangers, missing parts and a second run do no harm."""
+
+import re
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import matplotlib
+import numpy as np
+import pytest
+
+import baarda
+from baarda.discover import modules
+from baarda.formats import dbat
+from baarda.hypotheses.levels import Options
+from baarda.procedures.testing import analyse
+from baarda.report import page, plots
+from baarda.report.sections._facts import clusters, label_of
+from baarda.report.sections._numbers import with_sigma
+from baarda.report.sections.base import Cell, DataTable, Figure, Section, SectionMaker, Verdict
+from networks import FREE_BROWN, ring
+
+HOSTILE = (
+    "<script>alert(1)</script>",
+    "$x^2$",
+    '"onload="x',
+    "a&b",
+    "{{7*7}}",
+    "]]>-->",
+    "&lt;",
+    "\x1b[2J",
+    "\u202eevil",
+    "图像",
+    "</svg>",
+    "%s{0}",
+)
+
+
+@pytest.fixture(scope="module")
+def calibration(camcal):
+    return analyse(baarda.adjust(dbat.read(camcal)))
+
+
+@pytest.fixture(scope="module")
+def aerial(data):
+    return analyse(baarda.adjust(dbat.read(data("dbat_sxb") / "sxb.xml")))
+
+
+def hostile_network():
+    n = ring(control=5, checks=2)
+
+    def named(count):
+        return tuple(f"{HOSTILE[k % len(HOSTILE)]}{k}" for k in range(count))
+
+    return replace(
+        n,
+        name="<img src=x onerror=alert(1)>",
+        assumptions=("<b>$\\alpha$</b>",),
+        path="http://example.invalid/<i>",
+        cameras=tuple(replace(c, label="<script>$x^2$") for c in n.cameras),
+        images=replace(n.images, labels=named(len(n.images.labels))),
+        points=replace(n.points, labels=named(len(n.points.labels))),
+    )
+
+
+@pytest.fixture(scope="module")
+def hostile():
+    return analyse(baarda.adjust(hostile_network()))
+
+
+@pytest.fixture(scope="module", params=["calibration", "aerial", "hostile", "not_converged"])
+def pages(request):
+    if request.param == "not_converged":
+        analysis = analyse(baarda.adjust(ring(), iterations=1))
+    else:
+        analysis = request.getfixturevalue(request.param)
+    made = page.sections(analysis)
+    return analysis, made, page.html(analysis, made)
+
+
+VOID = {"meta", "br", "img", "link", "input", "hr"}
+
+
+class Page(HTMLParser):
+    """Reads a page as a browser would: elements with attributes, in balance."""
+
+    def __init__(self, text):
+        super().__init__(convert_charrefs=True)
+        self.elements, self.open, self.words = [], [], []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        assert len({k for k, _ in attrs}) == len(attrs), f"<{tag}> repeats an attribute"
+        self.elements.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self.open and self.open[-1] == tag, f"</{tag}> closes {self.open[-3:]}"
+        self.open.pop()
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+    def named(self, tag):
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+# ---- what it says ----------------------------------------------------------------------------------------------------------------------
+
+
+def test_verdict_of_the_calibration(calibration):
+    assert page.verdict(calibration) == [
+        "The adjustment converged in 9 iterations: 4148 observations determine 423 unknowns with a redundancy of 3725, 0.90 per observation "
+        "on average.",
+        "The variance factor 2.608 lies outside 0.955..1.046: the residuals are 1.61 times as large as the a-priori sigmas promise.",
+        "All 6 additional camera parameters differ significantly from zero at level 0.05 (smallest |t| = 11.2 for P2, limit 1.96).",
+        "45 of 4148 observations are suspected of a gross error (|tau| above 3.29; chance alone would show 4.1); the worst is image 19 "
+        "point 8 x with tau = -5.86: estimated error 1.03 px. 31 of them gather at points 1004, 1003, 1001, 1002.",
+        "A gross error in an image coordinate is found with probability 0.80 from 0.43 px on (median, by the a-priori sigmas); the least "
+        "controlled one, image 21 point 11 x, may hide up to 0.50 px.",
+        "The object points have standard deviations of 0.039 / 0.039 / 0.065 mm in X / Y / Z (medians, a posteriori); the weakest is point "
+        "90 with 0.112 mm in space.",
+        "The standardised residuals do not follow the normal law (chi-square 227.9, limit 72.2, p < 0.0001); of the laws tried the "
+        "modulated normal law (a = -0.12) fits best by AIC, though it is rejected too.",
+    ]
+
+
+def test_verdict_of_the_aerial_block(aerial):
+    said = page.verdict(aerial)
+    assert 5 <= len(said) <= 8
+    whole = " ".join(said)
+    assert "variance factor 1.389 lies outside 0.923..1.080" in whole
+    assert "2 check points differ from the survey by more than the predicted precision allows (T = 11.99, limit 2.10" in whole
+    assert "contradicts its sigmas (T = 2.63, limit 1.42): 5 of 14 points are rejected singly, the worst is 492." in whole
+
+
+def test_sentences_follow_the_tests():
+    network = ring(control=5, checks=3)
+    said = " ".join(page.verdict(analyse(baarda.adjust(network), Options(sigma="apriori"))))
+    assert "lies within" in said and "|w| above" in said and "a priori" in said
+    assert "no more than the predicted precision allows" in said and "agrees with its sigmas" in said
+    too_small = ring(control=5, noise=0.05)  # sigma stays 0.1 px
+    assert "only 0." in page.verdict(analyse(baarda.adjust(too_small, image_sigma=1.0)))[1]
+    idle = ring(noise=0.3, free=(*FREE_BROWN, "K2", "K3"), points=12)
+    assert "not differ significantly from zero" in " ".join(page.verdict(analyse(baarda.adjust(idle))))
+
+
+def test_not_converged_says_so_and_tests_nothing():
+    analysis = analyse(baarda.adjust(ring(), iterations=1))
+    (only,) = page.verdict(analysis)
+    assert "did not converge" in only and "nothing was tested" in only
+    assert [s.id for s in page.sections(analysis)] == ["verdict", "problems", "data", "settings"]
+
+
+def test_sections_come_in_order_and_vanish(calibration, aerial):
+    ids = ["verdict", "problems", "data", "groups", "cameras", "images", "points", "suspected", "check-control", "tests", "law"]
+    ids += ["residual-vectors", "network-plan", "settings"]
+    assert [s.id for s in page.sections(aerial)] == ids
+    assert [s.id for s in page.sections(calibration)] == [i for i in ids if i != "check-control"]
+
+
+def test_suspected_observations_gather_at_the_control_points(calibration):
+    found = [(c.label, c.suspected, c.tested, c.known) for c in clusters(calibration)]
+    assert found == [("1004", 9, 42, "fixed control"), ("1003", 8, 42, "fixed control")] + [
+        (p, 7, 42, "fixed control") for p in ("1001", "1002")
+    ]
+
+
+def test_the_report_judges_by_the_numbers_of_the_tests(calibration, aerial):
+    for analysis in (calibration, aerial):
+        test = analysis.tests_named("data_snooping")[0]
+        np.testing.assert_allclose(analysis.tau, test.statistic, rtol=1e-12)
+        worst = int(analysis.suspected[0])
+        assert label_of(analysis, worst) == test.labels[worst]
+
+
+def test_camera_table_of_the_calibration(calibration):
+    section = next(s for s in page.sections(calibration) if s.id == "cameras")
+    rows = {row[0]: row for row in section.blocks[0].rows}
+    assert rows["principal_distance"][1:5] == ("mm", "7.4570", "0.0010", "7.5")
+    assert rows["K3"][1:4] == ("mm⁻⁶", "-2.05e-06", "1.0e-07")
+    assert rows["B2"][3] == "–" and rows["B2"][8] == "fixed"
+    assert rows["P2"][7] == Cell("significant", "good")
+
+
+def test_tables_are_limited_and_point_at_the_files(aerial):
+    section = next(s for s in page.sections(aerial) if s.id == "points")
+    table = next(b for b in section.blocks if isinstance(b, DataTable) and b.caption == "All points")
+    assert len(table.rows) == 200 and table.folded
+    assert table.note == "The first 200 of 381 rows; all are in tables/points.csv."
+
+
+def test_every_row_fits_its_table(pages):
+    for section in pages[1]:
+        for block in section.blocks:
+            if isinstance(block, DataTable):
+                assert {len(row) for row in block.rows} == {len(block.columns)}, block.caption
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma"), [(7.456995, 0.00104583), (-4.51351e-05, 2.6e-06), (999660.94, 0.465), (0.1, 0.0996), (3.2, 45.0)]
+)
+def test_value_has_the_digits_of_its_sigma(value, sigma):
+    v, s = with_sigma(value, sigma)
+    assert float(s) == pytest.approx(sigma, rel=0.05)
+    assert abs(float(v) - value) <= 0.06 * sigma
+    assert len(v.split("e")[0].partition(".")[2]) <= 8
+
+
+# ---- the page --------------------------------------------------------------------------------------------------------------------------
+
+
+def test_page_is_well_formed(pages):
+    _, made, text = pages
+    read = Page(text)
+    assert read.open == []
+    assert text.startswith("<!DOCTYPE html>") or text.lstrip().startswith("<!DOCTYPE html>")
+    assert read.named("html")[0]["lang"] == "en"
+    ids = [a["id"] for _, a in read.elements if "id" in a]
+    assert len(ids) == len(set(ids))
+    links = {a["href"][1:] for a in read.named("a")}
+    assert links <= set(ids) and {s.id for s in made} <= links
+    assert len(read.named("h1")) == 1 and len(read.named("h2")) == len(made)
+
+
+def test_page_loads_nothing(pages):
+    _, _, text = pages
+    read = Page(text)
+    csp = next(a["content"] for a in read.named("meta") if a.get("http-equiv") == "Content-Security-Policy")
+    assert csp.startswith("default-src 'none'; style-src 'unsafe-inline'; img-src data:")
+    assert not {tag for tag, _ in read.elements} & {"script", "link", "iframe", "object", "embed", "img", "base", "form", "video", "audio"}
+    for tag, attributes in read.elements:
+        for key, value in attributes.items():
+            assert not key.startswith("on"), (tag, key)
+            if key in ("href", "src", "xlink:href"):
+                assert value.startswith(("#", "data:image/png;base64,")), (tag, key, value)
+            if key not in ("aria-label", "title"):
+                assert "http:" not in (value or "") and "https:" not in (value or ""), (tag, key, value)
+    style = text[text.index("<style>") : text.index("</style>")]
+    assert "@import" not in style and "url(" not in style
+
+
+def test_real_pages_do_not_even_name_an_address(calibration):
+    assert "http" not in page.html(calibration, page.sections(calibration)).replace("http-equiv", "")
+
+
+def test_page_is_accessible(pages):
+    _, made, text = pages
+    read = Page(text)
+    drawings = [a for a in read.named("svg") if a.get("role") == "img"]
+    assert len(drawings) == len(read.named("svg")) == sum(isinstance(b, Figure) for s in made for b in s.blocks)
+    assert all(len(a["aria-label"]) > 40 for a in drawings)
+    assert len(read.named("caption")) == len(read.named("table"))
+    assert all(a.get("scope") in ("col", "row") for a in read.named("th"))
+    regions = [a for a in read.named("div") if a.get("role") == "region"]
+    assert all(a["tabindex"] == "0" and a["aria-label"] for a in regions)
+    badges = re.findall(r'<span class="badge [^"]*">([^<]*)</span>', text)
+    assert badges and all(b.strip() for b in badges), "a colour without a word"
+
+
+def test_text_and_page_lay_out_the_same(pages):
+    _, made, text = pages
+    words = " ".join(" ".join(Page(text).words).split())
+    plain = page.text(made)
+    for number, section in enumerate(made, start=1):
+        assert f"{number} {section.title}\n=" in plain
+        for block in section.blocks:
+            if isinstance(block, DataTable):
+                assert block.caption in words and block.caption in plain
+            elif isinstance(block, Verdict):
+                assert all(page.printable(s.text) in words for s in block.sentences)
+    lines = plain.splitlines()
+    assert all(line == line.rstrip() for line in lines)
+
+
+def test_hostile_names_stay_names(hostile):
+    made = page.sections(hostile)
+    text = page.html(hostile, made)
+    read = Page(text)
+    words = "".join(read.words)
+    for name in ("<script>alert(1)</script>0", "$x^2$1", '"onload="x2', "a&b3", "{{7*7}}4", "]]>-->5"):
+        assert name in words, name
+    assert "<img src=x onerror=alert(1)>" in words and "<b>$\\alpha$</b>" in words
+    assert "<script" not in text and "<img" not in text and "<b>$" not in text
+    for hidden in ("\x1b", "\u202e"):
+        assert hidden not in text and hidden not in page.text(made) and hidden not in " ".join(page.verdict(hostile))
+    plan = page.figures(made)["network-plan"]
+    assert ">$x^2$1</text>" in plan and ">&lt;script&gt;alert" in plan  # written as it is, not set as a formula
+    assert all(re.fullmatch(r"[a-z0-9-]+", name) for name in page.figures(made)), "a name reached a file name"
+
+
+def test_figures_stand_alone(pages):
+    drawings = page.figures(pages[1])
+    for name, svg in drawings.items():
+        root = ET.fromstring(svg)
+        assert root.tag == "{http://www.w3.org/2000/svg}svg", name
+        assert root.get("role") == "img" and root[0].tag.endswith("title") and root[1].tag.endswith("desc")
+        assert not root.findall(".//{http://www.w3.org/2000/svg}metadata")
+        assert "<!--" not in svg
+
+
+def test_two_runs_give_the_same_bytes():
+    def once():
+        analysis = analyse(baarda.adjust(hostile_network()))
+        made = page.sections(analysis)
+        return page.html(analysis, made), page.text(made), page.figures(made)
+
+    assert once() == once()
+
+
+def test_members_are_one_file_each():
+    makers = [[v for v in vars(m).values() if isinstance(v, SectionMaker)] for m in modules("baarda.report.sections")]
+    assert [len(found) for found in makers] == [1] * len(makers)
+    assert len({found[0].order for found in makers}) == len({found[0].id for found in makers}) == len(makers)
+    assert all(re.fullmatch(r"[a-z-]+", found[0].id) for found in makers)
+
+
+def test_a_maker_without_blocks_makes_nothing(hostile):
+    assert SectionMaker(1, "x", "X", lambda analysis: None).make(hostile) is None
+    assert SectionMaker(1, "x", "X", lambda analysis: []).make(hostile) is None
+    assert isinstance(SectionMaker(1, "x", "X", lambda analysis: [Verdict(())]).make(hostile), Section)
+
+
+# ---- figures ---------------------------------------------------------------------------------------------------------------------------
+
+
+def test_figures_leave_matplotlib_as_it_was():
+    before = dict(matplotlib.rcParams)
+    first = plots.histogram(np.linspace(-3, 3, 50), [], "x")
+    with matplotlib.rc_context({"font.size": 30.0, "axes.grid": True, "svg.fonttype": "path"}):
+        assert plots.histogram(np.linspace(-3, 3, 50), [], "x") == first, "a user's settings change the report"
+    assert dict(matplotlib.rcParams) == before
+
+
+@pytest.mark.parametrize(("count", "rasters"), [(400, False), (6000, True)])
+def test_many_marks_become_a_picture(count, rasters):
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0.0, 1.0, (count, 3))
+    ends = (np.array([[0.5, 0.5, 3.0]]), np.array([[0.0, 0.0, -1.0]]))
+    svg = plots.plan(points, rng.uniform(1.0, 2.0, count), ["tie"] * count, *ends, ["1"], "m", "mm")
+    assert ("data:image/png;base64," in svg) == rasters
+    assert len(svg) < 400_000
+
+
+def test_residual_grid_means_by_cell():
+    rng = np.random.default_rng(1)
+    xy, v = rng.uniform(0.0, [300.0, 200.0], (500, 2)), rng.standard_normal((500, 2))
+    centres, means, counts = plots.residual_grid(xy, v, (300.0, 200.0), 6)
+    assert counts.sum() == 500 and len(centres) == 24
+    np.testing.assert_allclose((means * counts[:, None]).sum(axis=0), v.sum(axis=0), atol=1e-12)
+    for c, m, n in zip(centres, means, counts, strict=True):
+        inside = (np.abs(xy - c) <= 25.0).all(axis=1)
+        assert inside.sum() == n
+        np.testing.assert_allclose(v[inside].mean(axis=0), m, atol=1e-12)
+
+
+def test_vectors_are_drawn_to_scale():
+    at, v = np.array([[100.0, 100.0], [300.0, 100.0]]), np.array([[1.0, 0.0], [0.0, 2.0]])
+    svg, arrow = plots.vectors(at, v, [False, False], (0.0, 400.0, 0.0, 200.0), True, "v")
+    assert arrow in (1.0, 2.0) and f">{arrow:g} px</text>" in svg
