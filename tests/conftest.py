@@ -4,6 +4,10 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("baarda", deadline=None, derandomize=True)  # no timed tests, no random ones
+settings.load_profile("baarda")
 
 HERE = Path(__file__).parent
 SHARED = Path(os.environ.get("BAARDA_DATA", HERE.parent.parent / "shared" / "data"))

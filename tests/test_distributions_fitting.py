@@ -106,8 +106,8 @@ def test_the_normal_limit_is_reached_and_said() -> None:
 
 def test_infinite_a_is_the_best_for_more_than_half_of_normal_samples() -> None:
     rng = np.random.default_rng(8)
-    share = np.mean([np.isinf(fit(rng.standard_normal(200), loc=0.0).parameters["a"]) for _ in range(60)])
-    assert 0.4 < share < 0.75
+    share = np.mean([np.isinf(fit(rng.standard_normal(60), loc=0.0).parameters["a"]) for _ in range(40)])
+    assert 0.35 < share < 0.85
 
 
 def test_a_free_mean_keeps_a_above_a_quarter() -> None:
@@ -158,7 +158,7 @@ def test_condensed_values_lose_nothing() -> None:
     assert condensed == pytest.approx(np.sum(law.logpdf(x)), abs=2e-3)
     few = x[:30_000]
     found = fit(few)
-    import baarda.distributions.fitting as module
+    import baarda.distributions.sample as module
 
     keep = module.CONDENSE_FROM
     try:
@@ -203,12 +203,12 @@ def test_profile_interval() -> None:
 
 
 def test_many_data_sets_at_once_agree_with_one_by_one() -> None:
-    x = sample(0.5, 20 * 300, 15).reshape(300, 20)
+    x = sample(0.5, 12 * 300, 15).reshape(300, 12)
     for name, given in (("modulated_normal", {"loc": 0.0}), ("normal", {}), ("laplace", {}), ("radico", {}), ("student", {"loc": 0.0})):
         member = D.law(name)
         start = member(**({"a": 0.5} if name == "modulated_normal" else {}))
         values, log_likelihood = refit_columns(member, x, start, given)
-        for j in range(20):
+        for j in range(12):
             one = fit(x[:, j], member, **given)
             assert 0 <= one.log_likelihood - log_likelihood[j] + 1e-9 < 5e-3, (name, j)
             for p in one.estimated:
@@ -274,7 +274,7 @@ def test_bad_input_is_named(values: list, options: dict, words: str) -> None:
         fit(values, **options)
 
 
-# ---- SciPy --------------------------------------------------------------------------------------------------------------------------------
+# ---- SciPy --------------------------------------------------------------------------------
 
 
 def test_scipy_forms_of_the_modulated_laws() -> None:

@@ -115,8 +115,8 @@ class Page(HTMLParser):
 
 def test_verdict_of_the_calibration(calibration):
     assert page.verdict(calibration) == [
-        "The adjustment converged in 9 iterations: 4148 observations determine 423 unknowns with a redundancy of 3725, 0.90 per observation "
-        "on average.",
+        "The adjustment converged in 9 iterations: 4148 observations determine 423 unknowns with a redundancy of 3725, 0.90 per "
+        "observation on average.",
         "The variance factor 2.608 lies outside 0.955..1.046: the residuals are 1.61 times as large as the a-priori sigmas promise.",
         "All 6 additional camera parameters differ significantly from zero at level 0.05 (smallest |t| = 11.2 for P2, limit 1.96).",
         "45 of 4148 observations are suspected of a gross error (|tau| above 3.29; chance alone would show 4.1); the worst is image 19 "
@@ -203,7 +203,7 @@ def test_every_row_fits_its_table(pages):
 
 
 @pytest.mark.parametrize(
-    ("value", "sigma"), [(7.456995, 0.00104583), (-4.51351e-05, 2.6e-06), (999660.94, 0.465), (0.1, 0.0996), (3.2, 45.0)]
+    ("value", "sigma"), [(7.456995, 0.00104583), (-4.51351e-05, 2.6e-06), (999660.94, 0.465), (0.1, 0.0996), (3.2, 45.0), (0.0, 1e-9)]
 )
 def test_value_has_the_digits_of_its_sigma(value, sigma):
     v, s = with_sigma(value, sigma)
@@ -219,7 +219,7 @@ def test_page_is_well_formed(pages):
     _, made, text = pages
     read = Page(text)
     assert read.open == []
-    assert text.startswith("<!DOCTYPE html>") or text.lstrip().startswith("<!DOCTYPE html>")
+    assert text.startswith("<!DOCTYPE html>")
     assert read.named("html")[0]["lang"] == "en"
     ids = [a["id"] for _, a in read.elements if "id" in a]
     assert len(ids) == len(set(ids))
@@ -343,8 +343,8 @@ def test_many_marks_become_a_picture(count, rasters):
     points = rng.uniform(0.0, 1.0, (count, 3))
     ends = (np.array([[0.5, 0.5, 3.0]]), np.array([[0.0, 0.0, -1.0]]))
     svg = plots.plan(points, rng.uniform(1.0, 2.0, count), ["tie"] * count, *ends, ["1"], "m", "mm")
-    assert ("data:image/png;base64," in svg) == rasters
-    assert len(svg) < 400_000
+    assert svg.count("<use ") < 100 if rasters else svg.count("<use ") > 2 * count
+    assert len(svg) < 900_000
 
 
 def test_residual_grid_means_by_cell():

@@ -43,7 +43,7 @@ def test_mean_deviations() -> None:
     assert ModulatedNormal(np.inf).mean_deviation() == pytest.approx(0.79788, abs=5e-6)
 
 
-# ---- Table 1: residuals V, classes of 4 um from -24 to 24; one further value above 24 -------------------------------------------------------
+# ---- Table 1: residuals V, classes of 4 um from -24 to 24; one further value above 24 --------------------------------------------------
 
 COUNTS_V = np.array([3, 5, 20, 59, 94, 149, 142, 88, 40, 18, 7, 4])
 EDGES_V = np.arange(-24.0, 25.0, 4.0)
@@ -141,7 +141,7 @@ def test_moment_estimates_of_a() -> None:
         assert 3 + ModulatedNormal(np.sqrt(kurtosis / (kurtosis - 3)) - 2).excess_kurtosis() == pytest.approx(kurtosis, rel=1e-12)
 
 
-# ---- Table 2 and Table 3 ---------------------------------------------------------------------------------------------------------------------
+# ---- Table 2 and Table 3 --------------------------------------------------
 
 
 def test_table_2_and_table_3_normal() -> None:
@@ -153,7 +153,7 @@ def test_table_2_and_table_3_normal() -> None:
     assert not result.rejected
 
 
-# ---- Tables 5 and 6: residuals U --------------------------------------------------------------------------------------------------------------
+# ---- Tables 5 and 6: residuals U --------------------------------------------------
 
 POSITIVE = np.array([44, 36, 24, 13, 12, 3, 4, 4, 4, 2])
 NEGATIVE = np.array([49, 37, 24, 12, 14, 4, 3, 4, 2, 3])

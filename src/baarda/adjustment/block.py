@@ -138,6 +138,7 @@ class BlockSolver:
         matrix = sparse.csr_array((np.concatenate(values), np.concatenate(columns), starts), shape=(len(starts) - 1, size + 1))
         return matrix[:, :size]  # without the dummy column
 
+    @cached_property
     def _inverse(self) -> Floats:
         n = len(self.kept)
         out = np.zeros((n + 1, n + 1))
@@ -148,7 +149,7 @@ class BlockSolver:
 
     def hat(self) -> list[Floats]:
         """Return for each chunk the (N, m, m) diagonal blocks of A N^-1 A'."""
-        z = self._inverse()
+        z = self._inverse
         out = [np.zeros((len(c.first), c.misclosure.shape[1], c.misclosure.shape[1])) for c in self.lin.chunks]
         for at, where, jacobian in self.rest:
             h = jacobian @ z[at[:, :, None], at[:, None, :]] @ jacobian.transpose(0, 2, 1)
@@ -170,7 +171,7 @@ class BlockSolver:
 
     def blocks(self, columns: Ints) -> Floats:
         """Return the (N, w, w) blocks of N^-1 for (N, w) columns: nodes of the reduced system, or whole points."""
-        z = self._inverse()
+        z = self._inverse
         at = self.place[columns]
         out = np.asarray(z[at[:, :, None], at[:, None, :]])
         if columns.shape[1] == 3 and len(columns):

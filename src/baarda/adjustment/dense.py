@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +37,7 @@ class DenseSolver:
         """
         kept = np.setdiff1d(np.arange(lin.unknowns.count), held)
         scale = lin.scale[kept]
-        a = lin.design[:, kept].toarray() / scale
-        normal = a.T @ a
+        normal = (lin.design.T @ lin.design).toarray()[np.ix_(kept, kept)] / np.outer(scale, scale)
         factor, rcond = factorise(normal + damping * np.eye(len(kept)), [kept], lin)
         return DenseSolver(lin, kept, factor, scale, rcond)
 
@@ -50,22 +50,27 @@ class DenseSolver:
 
     def hat(self) -> list[Floats]:
         """Return for each chunk the (N, m, m) diagonal blocks of A N^-1 A'."""
+        inverse = self._inverse
         out = []
         for c in self.lin.chunks:
-            n, m = c.misclosure.shape
-            rows = self.lin.design[c.rows.ravel()][:, self.kept].toarray() / self.scale
-            half = linalg.solve_triangular(self.factor, rows.T, lower=True).T.reshape(n, m, -1)
-            out.append(np.asarray(half @ half.transpose(0, 2, 1)))
+            at = self.place[np.concatenate([p.columns for p in c.parts], axis=1)]
+            jacobian = np.concatenate([p.jacobian for p in c.parts], axis=2)
+            out.append(np.asarray(jacobian @ inverse[at[:, :, None], at[:, None, :]] @ jacobian.transpose(0, 2, 1)))
         return out
 
     def blocks(self, columns: Ints) -> Floats:
         """Return the (N, w, w) blocks of N^-1 for (N, w) columns; zero for columns below zero and held ones."""
-        inverse = self._inverse()
+        at = self.place[columns]
+        return np.asarray(self._inverse[at[:, :, None], at[:, None, :]])
+
+    @cached_property
+    def place(self) -> Ints:
+        """Row of each unknown in the factor; the last one, for -1 and held unknowns, is a row of zeros in the inverse."""
         place = np.full(self.lin.unknowns.count + 1, len(self.kept))
         place[self.kept] = np.arange(len(self.kept))
-        at = place[columns]
-        return np.asarray(inverse[at[:, :, None], at[:, None, :]])
+        return place
 
+    @cached_property
     def _inverse(self) -> Floats:
         n = len(self.kept)
         out = np.zeros((n + 1, n + 1))

@@ -130,7 +130,7 @@ class Adjustment:
     @cached_property
     def _statistics(self) -> dict[str, Floats]:
         """Diagonals of Qvv, Qvv P and P Qvv P, and P v, from the blocks I - H of whitened residuals."""
-        out = {name: np.empty(self.count) for name in ("qvv", "redundancy", "pqvvp", "pv")}
+        out = {name: np.empty(self.count) for name in ("qvv", "redundancy", "pqvvp", "pv", "weight")}
         with threadpool_limits(limits=1, user_api="blas"):
             hats = self.solver.hat()
         for c, hat in zip(self.lin.chunks, hats, strict=True):
@@ -141,6 +141,7 @@ class Adjustment:
             out["qvv"][c.rows] = np.einsum("nij,nij->ni", left, c.factor)
             out["redundancy"][c.rows] = np.einsum("nij,nji->ni", left, inverse)
             out["pqvvp"][c.rows] = np.einsum("nij,nji->ni", weighted @ rest, inverse)
+            out["weight"][c.rows] = np.einsum("nij,nji->ni", weighted, inverse)
             out["pv"][c.rows] = -(weighted @ c.misclosure[:, :, None])[:, :, 0]
         return out
 
@@ -148,6 +149,14 @@ class Adjustment:
     def redundancy_numbers(self) -> Floats:
         """r_i = (Qvv P)_ii of all n observations; they sum to r."""
         return self._statistics["redundancy"]
+
+    @property
+    def controlled_share(self) -> Floats:
+        """(P Qvv P)_ii / P_ii, between 0 and 1.
+
+        The redundancy number of uncorrelated observations, and what stands for it in w, mdb and external reliability of correlated ones.
+        """
+        return np.asarray(self._statistics["pqvvp"] / self._statistics["weight"])
 
     @property
     def qvv(self) -> Floats:
@@ -263,6 +272,29 @@ class Adjustment:
     def camera_estimates(self) -> Estimates:
         """All estimated camera parameters with their joint cofactors."""
         return self._camera_estimates(additional_only=False)
+
+    def camera_correlations(self, limit: float = 0.95) -> list[tuple[str, str, float]]:
+        """Return the pairs of unknowns with a camera parameter whose correlation reaches the limit, the highest first.
+
+        Camera parameters among themselves, and with the orientation unknowns of the images.
+        """
+        e, group = self.camera_estimates, self.numbering["image"]
+        if not e.names:
+            return []
+        columns = np.array([self.numbering.column(name) for name in e.names], dtype=np.intp)
+        at = group.columns.reshape(-1, 6)
+        images = at[at >= 0]
+        variances = np.einsum("nii->ni", self.cofactors.blocks(at))[at >= 0]
+        unit = np.zeros((self.numbering.count, len(columns)))
+        unit[columns, np.arange(len(columns))] = 1.0
+        others = np.concatenate([columns, images])
+        q = self.cofactors.solve(unit)[others]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            r = q / np.sqrt(np.outer(np.concatenate([np.diag(e.cofactors), variances]), np.diag(e.cofactors)))
+        r[: len(columns)] = np.tril(r[: len(columns)], -1)
+        rows, which = np.nonzero(np.abs(r) >= limit)
+        found = [(e.names[j], self.numbering.names[others[i]], float(r[i, j])) for i, j in zip(rows, which, strict=True)]
+        return sorted(found, key=lambda pair: -abs(pair[2]))
 
     def _camera_estimates(self, additional_only: bool) -> Estimates:
         group = self.numbering["camera"]

@@ -21,7 +21,7 @@ _PUBLIC = {
     "Histogram": "histogram",
     "equal_probability_edges": "histogram",
     "equal_width_edges": "histogram",
-    "Fit": "fitting",
+    "Fit": "result",
     "fit": "fitting",
     "profile_interval": "fitting",
     "fit_classes": "class_fitting",

@@ -11,8 +11,10 @@ from scipy import optimize, special
 
 from baarda.distributions import law as find_law
 from baarda.distributions.base import Distribution, Floats, Law
-from baarda.distributions.fitting import Fit, _shape_from_kurtosis, given_values
 from baarda.distributions.histogram import Ends, Histogram, check_edges, probabilities
+from baarda.distributions.moments import shape_from_kurtosis
+from baarda.distributions.result import Fit
+from baarda.distributions.sample import given_values
 from baarda.errors import UsageError
 
 
@@ -176,7 +178,7 @@ def _start(member: Law, f: Floats, b: Floats, given: Mapping[str, float]) -> dic
     for shape in unknown:
         values[shape.name] = shape.start
     if len(unknown) == 1 and variance > 0.0:
-        value, at_bound = _shape_from_kurtosis(member, unknown[0], float(np.sum(f * d2 * d2) / n / variance**2) - 3.0)
+        value, at_bound = shape_from_kurtosis(member, unknown[0], float(np.sum(f * d2 * d2) / n / variance**2) - 3.0)
         values[unknown[0].name] = unknown[0].start if at_bound else value
     if "scale" not in given:
         unit = member.with_values(values | {"scale": 1.0}).std()

@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike
 from baarda.distributions import law as find_law
 from baarda.distributions.base import Law
 from baarda.distributions.class_fitting import histogram_of
-from baarda.distributions.fitting import Fit, Sample, check_values, given_values, maximise
 from baarda.distributions.histogram import Ends, check_edges, count, equal_probability_edges, usual_number_of_classes
+from baarda.distributions.likelihood import maximise
+from baarda.distributions.result import Fit as Fit
+from baarda.distributions.sample import Sample, check_values, given_values
 from baarda.errors import UsageError
 
 USUAL = ("normal", "radico", "lineo", "modulated_normal")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from baarda.distributions.base import Distribution, Floats, Law
-from baarda.distributions.fitting import FREE_CENTRE_LOWER
+from baarda.distributions.likelihood import FREE_CENTRE_LOWER
 from baarda.errors import UsageError
 
 _ROUNDS = 40

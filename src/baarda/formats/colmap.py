@@ -69,7 +69,7 @@ def read(path: Path) -> Network:
     if not kinds:
         have = [p for kind in ("bin", "txt") for p in PARTS if (path / f"{p}.{kind}").is_file()]
         missing = ", ".join(p for p in PARTS if p not in have)
-        raise InputError(f"not a COLMAP model: {missing} is missing (a folder with cameras, images and points3D, all .bin or all .txt)", path)
+        raise InputError(f"not a COLMAP model: {missing} is missing (needed: cameras, images, points3D, all .bin or all .txt)", path)
     if len(kinds) == 2:
         notes.append("the folder holds a binary and a text model: the binary one is used, as COLMAP does")
     kind = kinds[0]

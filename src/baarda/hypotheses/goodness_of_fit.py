@@ -12,7 +12,7 @@ from scipy import stats
 from baarda.distributions import law as find_law
 from baarda.distributions.base import Distribution, Law
 from baarda.distributions.class_fitting import check_counts, histogram_of
-from baarda.distributions.fitting import Fit, check_values, fit
+from baarda.distributions.fitting import fit
 from baarda.distributions.histogram import (
     Ends,
     check_edges,
@@ -23,6 +23,8 @@ from baarda.distributions.histogram import (
     usual_number_of_classes,
 )
 from baarda.distributions.replicas import columnwise, refit_columns
+from baarda.distributions.result import Fit
+from baarda.distributions.sample import check_values
 from baarda.errors import UsageError
 from baarda.hypotheses._simulation import affordable, controlled, shares, skipped_note
 from baarda.hypotheses.base import Evidence, Floats, SimulatedLaw, TestResult

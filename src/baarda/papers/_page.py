@@ -42,10 +42,10 @@ def _why(r: Row) -> str:
     return "; ".join(t for t in ("" if r.reason is None else r.reason.code, r.remark) if t)
 
 
-def rows(c: Comparison) -> Iterator[tuple[tuple[str, ...], str, str, str, str, bool]]:
-    """Yield labels, printed value, ours, difference, reason (as text) and whether they agree, of each row."""
+def rows(c: Comparison) -> Iterator[tuple[tuple[str, ...], str, str, str, str]]:
+    """Yield labels, printed value, ours, difference and reason of each row, as text."""
     for r in c.rows:
-        yield r.labels, _shown(r.printed, r.decimals), _shown(r.ours, r.decimals), _difference(r), _why(r), r.agrees
+        yield r.labels, _shown(r.printed, r.decimals), _shown(r.ours, r.decimals), _difference(r), _why(r)
 
 
 def render_text(reproduction: Reproduction) -> str:
@@ -83,10 +83,12 @@ def render_text(reproduction: Reproduction) -> str:
 
 def _grid(c: Comparison) -> list[str]:
     table = [[*c.columns, *c.heads, "difference", "reason"]]
-    table += [[*labels, printed, ours, difference, why] for labels, printed, ours, difference, why, _ in rows(c)]
+    table += [[*labels, printed, ours, difference, why] for labels, printed, ours, difference, why in rows(c)]
     widths = [max(len(line[k]) for line in table) for k in range(len(table[0]))]
     right = range(len(c.columns), len(c.columns) + 3)
-    lines = ["  ".join(t.rjust(w) if k in right else t.ljust(w) for k, (t, w) in enumerate(zip(line, widths, strict=True))) for line in table]
+    lines = [
+        "  ".join(t.rjust(w) if k in right else t.ljust(w) for k, (t, w) in enumerate(zip(line, widths, strict=True))) for line in table
+    ]
     return [lines[0], "-" * len(lines[0].rstrip()), *lines[1:], ""]
 
 

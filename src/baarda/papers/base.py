@@ -56,6 +56,10 @@ class Row:
     remark: str = ""
 
     def __post_init__(self) -> None:
+        for name in ("printed", "ours"):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, str):
+                object.__setattr__(self, name, float(value))  # NumPy numbers are no JSON
         if self.agrees == (self.reason is not None):
             what = "agree and carry a reason" if self.agrees else "differ without a reason"
             raise UsageError(f"{' / '.join(self.labels)}: printed {self.printed} and ours {self.ours} {what}")
@@ -79,7 +83,9 @@ def _agree(printed: Value | None, ours: Value, decimals: int) -> bool:
     return abs(ours - printed) <= 0.5 * 10.0**-decimals * (1.0 + 1e-9)
 
 
-def row(labels: tuple[str, ...], printed: Value | None, ours: Value, decimals: int = 2, reason: Reason | None = None, remark: str = "") -> Row:
+def row(
+    labels: tuple[str, ...], printed: Value | None, ours: Value, decimals: int = 2, reason: Reason | None = None, remark: str = ""
+) -> Row:
     """Return a row; the reason is kept only where the values differ.
 
     Examples

@@ -15,10 +15,11 @@ from baarda.distributions.fitting import Fit
 from baarda.hypotheses import run
 from baarda.hypotheses.base import Evidence, TestResult
 from baarda.hypotheses.levels import Options
-from baarda.hypotheses.outliers import TauLaw, estimated_error, external_reliability, mdb, standardised, tau
+from baarda.hypotheses.outliers import TauLaw, external_reliability, mdb, standardised, tau
 from baarda.network import Table
 
 Floats = NDArray[np.float64]
+FEWEST = 20  # residuals for a comparison of laws
 
 
 @dataclass(frozen=True)
@@ -59,32 +60,39 @@ class Analysis:
     def w(self) -> Floats:
         """Baarda's w of every observation, a priori sigma0; NaN where uncontrolled."""
         e = self.evidence
-        return standardised(_present(e.pv), _present(e.pqvvp), e.sigma0_apriori, e.redundancy_numbers)
+        return standardised(_present(e.pv), _present(e.pqvvp), e.sigma0_apriori, self.adjustment.controlled_share)
 
     @cached_property
     def tau(self) -> Floats:
         """Pope's tau of every observation, a posteriori s0; NaN where uncontrolled."""
         e = self.evidence
-        return tau(_present(e.pv), _present(e.pqvvp), e.variance_factor, e.redundancy_numbers)
+        return tau(_present(e.pv), _present(e.pqvvp), e.variance_factor, self.adjustment.controlled_share)
 
     @cached_property
     def observations(self) -> Table:
         """The observation table with w, tau, mdb, external reliability, estimated error and the p-value of the test that judges."""
         from scipy import stats
 
-        e, o = self.evidence, self.options
-        r = _present(e.redundancy_numbers)
+        e, o, share = self.evidence, self.options, self.adjustment.controlled_share
         statistic, law = (self.tau, TauLaw(e.redundancy)) if o.sigma == "aposteriori" else (self.w, stats.norm())
-        p = 2.0 * np.asarray(law.sf(np.abs(statistic)))
+        pv, pqvvp = _present(e.pv), _present(e.pqvvp)
+        seen = np.isfinite(statistic)
         more = {
             "w": self.w,
             "tau": self.tau,
-            "mdb": mdb(_cofactors(e), r, e.sigma0_apriori, o.alpha_outlier, o.power),
-            "external": external_reliability(r, o.alpha_outlier, o.power),
-            "estimated_error": estimated_error(e.residuals, r),
-            "p_value": p,
+            "mdb": mdb(share / np.where(seen, pqvvp, 1.0), share, e.sigma0_apriori, o.alpha_outlier, o.power),
+            "external": external_reliability(np.where(np.abs(share - 1.0) < 1e-12, 1.0, share), o.alpha_outlier, o.power),
+            "estimated_error": np.divide(-pv, pqvvp, out=np.full(len(pv), np.nan), where=seen),
+            "p_value": 2.0 * np.asarray(law.sf(np.abs(statistic))),
         }
         return Table({**self.adjustment.observations.columns, **more}, self.adjustment.observations.units)
+
+    @cached_property
+    def law_values(self) -> Floats:
+        """Residuals on which laws are compared: those of image points (of all observations, if there are none), divided by their sigmas."""
+        values = self.tau
+        images = np.isfinite(values) & (np.asarray(self.evidence.images) >= 0)
+        return values[images] if images.sum() >= FEWEST else values[np.isfinite(values)]
 
     @cached_property
     def suspected(self) -> NDArray[np.intp]:
@@ -100,13 +108,6 @@ class Analysis:
         """The gates of ``--strict``: True where the test was done and rejects."""
         names = ("global_variance_factor", "data_snooping", "check_points", "control_points")
         return {n: any(bool(np.any(t.rejected)) for t in self.tests_named(n)) for n in names if self.tests_named(n)}
-
-
-def _cofactors(e: Evidence) -> Floats:
-    """Return the cofactors that the minimal detectable bias needs: sigma^2, or r_i / (P Qvv P)_ii where observations are correlated."""
-    r, n = _present(e.redundancy_numbers), _present(e.pqvvp)
-    q = np.square(e.sigmas)
-    return np.divide(r, n, out=q.copy(), where=n > 0.0)
 
 
 def _present(values: Floats | None) -> Floats:
@@ -138,21 +139,9 @@ def analyse(adjustment: Adjustment, options: Options | None = None) -> Analysis:
 
 
 def _laws(analysis: Analysis) -> tuple[Fit, ...]:
-    """Compare laws on the residuals of image points (of all observations, if there are none), each divided by its own sigma."""
-    e = analysis.evidence
-    values = analysis.tau
-    chosen = np.isfinite(values) & (_present_int(e.images) >= 0)
-    if chosen.sum() < 20:
-        chosen = np.isfinite(values)
-    if chosen.sum() < 20:
-        return ()
-    return compare_laws(values[chosen], loc=0.0, scale=1.0, alpha=analysis.options.alpha)
-
-
-def _present_int(values: NDArray[np.intp] | None) -> NDArray[np.intp]:
-    if values is None:
-        raise ValueError("an adjustment yields all evidence")
-    return values
+    """Compare laws on standardised residuals, where there are enough."""
+    values = analysis.law_values
+    return compare_laws(values, loc=0.0, scale=1.0, alpha=analysis.options.alpha) if len(values) >= FEWEST else ()
 
 
 def test(adjustment: Adjustment, **options: Any) -> list[TestResult]:

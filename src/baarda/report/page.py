@@ -209,16 +209,16 @@ def html(analysis: Analysis, made: list[Section]) -> str:
         "inline": _inline,
         "glossary": glossary,
         "facts": _facts(analysis),
-        "overall": _overall(analysis),
+        "overall": _overall(analysis, made),
     }
     return environment.get_template("report.html.j2").render(context)
 
 
-def _overall(analysis: Analysis) -> tuple[str, str]:
+def _overall(analysis: Analysis, made: list[Section]) -> tuple[str, str]:
     """Return tone and words of the whole: the gravest sentence decides."""
     if not analysis.converged:
         return "bad", "Not converged: no result"
-    tones = [s.tone for s in sentences(analysis)]
+    tones = [s.tone for section in made for b in section.blocks if isinstance(b, Verdict) for s in b.sentences]
     bad, warn = tones.count("bad"), tones.count("warn")
     needs = "needs attention" if warn == 1 else "need attention"
     if bad:

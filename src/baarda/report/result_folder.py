@@ -95,7 +95,7 @@ def result_json(analysis: Analysis) -> dict[str, Any]:
         "assumptions": list(a.assumptions),
         "points_set_aside": [net.points.labels[i] for i in np.flatnonzero(a.aside)],
         "unknowns": camera + fixed,
-        "correlations": _correlations(a) if analysis.converged else [],
+        "correlations": [{"a": x, "b": y, "value": r} for x, y, r in a.camera_correlations()] if analysis.converged else [],
         "tests": [_test(t) for t in analysis.tests],
         "laws": [f.as_dict() for f in analysis.laws],
         "outliers": _outliers(analysis) if analysis.converged else [],
@@ -138,34 +138,6 @@ def _test(t: TestResult) -> dict[str, Any]:
             out["labels"] = list(t.labels)
     if t.note:
         out["note"] = t.note
-    return out
-
-
-def _correlations(a: Adjustment, limit: float = 0.95) -> list[dict[str, Any]]:
-    """Correlations of camera parameters, among themselves and with exterior unknowns, from `limit` on."""
-    names = a.numbering.names
-    e = a.camera_estimates
-    if not e.names:
-        return []
-    columns = np.array([a.numbering.column(n) for n in e.names])
-    image = a.numbering["image"].columns
-    image = image[image >= 0]
-    unit = np.zeros((a.numbering.count, len(columns)))
-    unit[columns, np.arange(len(columns))] = 1.0
-    q = a.cofactors.solve(unit)
-    others = np.concatenate([columns, image])
-    variances = np.empty(len(others))
-    variances[: len(columns)] = np.diag(e.cofactors)
-    blocks = a.cofactors.blocks(a.numbering["image"].columns.reshape(-1, 6))
-    kept = a.numbering["image"].columns.reshape(-1, 6) >= 0
-    variances[len(columns) :] = np.einsum("nii->ni", blocks)[kept]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        r = q[others] / np.sqrt(variances[:, None] * np.diag(e.cofactors)[None, :])
-    out = []
-    for j, name in enumerate(e.names):
-        for i in np.flatnonzero(np.abs(r[:, j]) >= limit):
-            if i > j:
-                out.append({"a": name, "b": names[others[i]], "value": r[i, j]})
     return out
 
 
@@ -244,6 +216,28 @@ def _cells(column: np.ndarray[Any, Any]) -> list[str]:
     return [str(v) for v in column.tolist()]
 
 
+def check_target(target: Path) -> None:
+    """Refuse, before any work, a target that cannot be written or that is somebody else's folder.
+
+    Raises
+    ------
+    OutputError
+        See `whole_folder`.
+    """
+    _temporary(target).rmdir()
+
+
+def _temporary(target: Path) -> Path:
+    """Make a temporary folder beside the target."""
+    try:
+        if target.exists() and not (target.is_dir() and (not any(target.iterdir()) or (target / "result.json").is_file())):
+            raise OutputError(f"{target} exists and is not a result folder: choose another --out")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        return Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    except OSError as error:
+        raise OutputError(f"cannot write {target}: {error.strerror}") from None
+
+
 @contextmanager
 def whole_folder(target: Path) -> Iterator[Path]:
     """Yield a temporary folder beside `target` and rename it there on success; on any failure nothing is left.
@@ -253,13 +247,7 @@ def whole_folder(target: Path) -> Iterator[Path]:
     OutputError
         If the target is a file or a folder that this program did not write, or if writing fails.
     """
-    if target.exists() and not (target.is_dir() and (not any(target.iterdir()) or (target / "result.json").is_file())):
-        raise OutputError(f"{target} exists and is not a result folder: choose another --out")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-    except OSError as error:
-        raise OutputError(f"cannot write beside {target}: {error.strerror}") from None
+    temporary = _temporary(target)
     try:
         yield temporary
         _permit(temporary)

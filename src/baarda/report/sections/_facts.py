@@ -19,7 +19,6 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
 MOST_ROWS = 200
-MOST_COLUMNS = 100  # camera parameters whose correlations are told one by one
 
 
 def result_of(analysis: Analysis, name: str) -> TestResult | None:
@@ -127,34 +126,6 @@ def sensor_residuals(analysis: Analysis, camera: int) -> tuple[Floats, Floats]:
             xy.append(group.xy[chosen])
             v.append(a.residuals[a.offsets[g] : a.offsets[g + 1]].reshape(-1, 2)[chosen])
     return np.concatenate(xy), np.concatenate(v)
-
-
-def correlations(analysis: Analysis, limit: float = 0.95) -> list[tuple[str, str, float]]:
-    """Return the pairs of unknowns with a camera parameter whose correlation reaches the limit, the highest first.
-
-    Camera parameters among themselves, and with the orientation unknowns of the images.
-    """
-    a = analysis.adjustment
-    e = a.camera_estimates
-    if not e.names:
-        return []
-    c = correlation_matrix(e.cofactors)
-    found = [(e.names[i], e.names[j], float(c[i, j])) for i, j in zip(*np.nonzero(np.triu(np.abs(c) >= limit, 1)), strict=True)]
-    group = a.numbering["image"]
-    at = group.columns.reshape(-1, 6)
-    if len(e.names) <= MOST_COLUMNS and (at >= 0).any():
-        columns = np.array([a.numbering.column(name) for name in e.names], dtype=np.intp)
-        unit = np.zeros((a.numbering.count, len(columns)))
-        unit[columns, np.arange(len(columns))] = 1.0
-        q = a.cofactors.solve(unit)
-        nodes, positions = np.nonzero(at >= 0)
-        variances = np.einsum("nii->ni", a.cofactors.blocks(at))[nodes, positions]
-        scale = np.sqrt(np.maximum(variances[:, None] * np.diag(e.cofactors)[None, :], np.finfo(float).tiny))
-        r = q[at[nodes, positions]] / scale
-        for i, j in zip(*np.nonzero(np.abs(r) >= limit), strict=True):
-            name = f"image {group.labels[nodes[i]]}: {group.parameters_of(int(nodes[i]))[positions[i]]}"
-            found.append((e.names[j], name, float(r[i, j])))
-    return sorted(found, key=lambda pair: -abs(pair[2]))
 
 
 def correlation_matrix(cofactors: Floats) -> Floats:

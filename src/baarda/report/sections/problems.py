@@ -12,7 +12,6 @@ from baarda.procedures.testing import Analysis
 from baarda.report.sections._facts import (
     bare,
     clusters,
-    correlations,
     image_rows,
     insignificant,
     label_of,
@@ -143,7 +142,7 @@ def _images(analysis: Analysis) -> Iterator[Problem]:
 
 
 def _correlated(analysis: Analysis) -> Iterator[Problem]:
-    found = correlations(analysis)
+    found = analysis.adjustment.camera_correlations()
     if found:
         shown = [f"{bare(a, analysis)} and {bare(b, analysis)} ({fixed(r, 3)})" for a, b, r in found]
         yield (

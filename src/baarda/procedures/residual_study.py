@@ -1,0 +1,507 @@
+"""The study of a column of residuals after Maarek & Konecny: moments, homogeneity of groups, scale rules, laws of errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+from baarda.distributions.base import Floats
+from baarda.distributions.class_fitting import fit_classes
+from baarda.distributions.fitting import Fit
+from baarda.distributions.histogram import count
+from baarda.errors import UsageError
+from baarda.hypotheses.base import TestResult
+from baarda.hypotheses.homogeneity import bartlett, variance_per_image
+from baarda.hypotheses.moments import kurtosis_of_residuals, mean_of_residuals, skewness_of_residuals
+from baarda.hypotheses.variance_factor import global_variance_factor
+from baarda.procedures.law_study import LawsStudied, ResidualsOf, StudyOptions, class_limits, study_laws
+
+LEAST = 3
+UNCONTROLLED = 1e-10  # a residual whose redundancy number is below is zero by construction
+_ROUNDING = 1e-9  # of redundancy numbers that another program printed
+
+Kind = Literal["raw", "weighted", "standardised"]
+Ints = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Groups:
+    """The groups of the values and the variance of each.
+
+    Attributes
+    ----------
+    names : tuple of str
+    codes : (n,) integer array
+        Group of each controlled value.
+    counts, means, variances, df : (k,) arrays
+        Of the (weighted) residuals. The variance is that about the group's mean with n_g - 1 degrees of freedom, or, where redundancy
+        numbers are given, v'Pv / r_g with r_g their sum; NaN without any.
+    by_redundancy : bool
+        Which of the two.
+    tests : tuple of TestResult
+        Bartlett (corrected), Bartlett as the paper has it, each group against the pooled variance, Brown-Forsythe; as far as they apply.
+    """
+
+    names: tuple[str, ...]
+    codes: Ints
+    counts: Ints
+    means: Floats
+    variances: Floats
+    df: Floats
+    by_redundancy: bool
+    tests: tuple[TestResult, ...] = ()
+
+    @property
+    def tested(self) -> Ints:
+        """Indices of the groups that have degrees of freedom and a variance."""
+        return np.flatnonzero((self.df > UNCONTROLLED) & (self.variances > 0.0))
+
+    def test(self, name: str) -> TestResult | None:
+        """Return the test of this name."""
+        return next((t for t in self.tests if t.name == name), None)
+
+
+@dataclass(frozen=True)
+class ScaleRule:
+    """A normal law whose standard deviation was found by one of the four rules, with its chi-square on classes.
+
+    Attributes
+    ----------
+    name : {"sample", "redundancy", "standardised", "minimum_chi2"}
+    symbol : str
+        S_M, S_o, Q_v, S_P: the paper's names.
+    mean, deviation : float
+    fit : Fit or None
+        With histogram and degrees of freedom; None where no classes could be formed.
+    described : bool
+        Whether the rule is for description only: S_o divides raw residuals by the redundancy, so that even truly normal errors are
+        rejected in about half of all cases. Such a rule has no p-value.
+    """
+
+    name: str
+    symbol: str
+    mean: float
+    deviation: float
+    fit: Fit | None
+    described: bool = False
+
+    @property
+    def p_value(self) -> float | None:
+        """Exceedance probability of the chi-square; None where the rule is descriptive."""
+        return None if self.fit is None or self.described else self.fit.p_value
+
+    @property
+    def rejected(self) -> bool | None:
+        """Decision of the chi-square test; None where the rule is descriptive."""
+        return None if self.fit is None or self.described else self.fit.rejected
+
+
+@dataclass(frozen=True)
+class ResidualStudy:
+    """Everything that a column of residuals tells.
+
+    Attributes
+    ----------
+    options : StudyOptions
+    values : (n,) array
+        The values studied; read-only.
+    kind : {"raw", "weighted", "standardised"}
+        Residuals as given; divided by their a-priori sigmas; divided by their own standard deviations s0 sigma sqrt(r).
+    base : (n,) array
+        Raw or weighted residuals of the same rows.
+    set_aside : int
+        Rows whose redundancy number is below 1e-10: no other observation controls them.
+    mean, deviation, skewness, kurtosis : float
+        Of `values`.
+    redundancy : float or None
+        Sum of the redundancy numbers.
+    sigma0 : float or None
+        A-posteriori standard deviation of unit weight.
+    tests : tuple of TestResult
+        Global test (with sigmas and redundancy numbers), mean, skewness, kurtosis.
+    groups : Groups or None
+    scale_rules : tuple of ScaleRule
+    laws : LawsStudied
+    a_of_errors : float or None
+        Approximate a of the errors behind modulated residuals; description only.
+    left_out : tuple of (str, str)
+        What could not be done, and why.
+    """
+
+    options: StudyOptions
+    values: Floats
+    kind: Kind
+    base: Floats
+    set_aside: int
+    mean: float
+    deviation: float
+    skewness: float
+    kurtosis: float
+    redundancy: float | None
+    sigma0: float | None
+    tests: tuple[TestResult, ...]
+    groups: Groups | None
+    scale_rules: tuple[ScaleRule, ...]
+    laws: LawsStudied
+    a_of_errors: float | None
+    left_out: tuple[tuple[str, str], ...]
+
+    @property
+    def n(self) -> int:
+        """The number of values studied."""
+        return len(self.values)
+
+    def test(self, name: str) -> TestResult | None:
+        """Return the test of this name."""
+        return next((t for t in self.tests if t.name == name), None)
+
+    @property
+    def gates(self) -> dict[str, bool]:
+        """What ``--strict`` asks: True where a test rejects."""
+        out = {t.name: bool(t.rejected) for t in self.tests if t.name in ("global_variance_factor", "mean_of_residuals")}
+        homogeneity = None if self.groups is None else self.groups.test("bartlett")
+        if homogeneity is not None:
+            out["bartlett"] = bool(homogeneity.rejected)
+        normal = next((s for s in self.laws.laws if s.fit.law == "normal"), None)
+        decision = None if normal is None else self.laws.rejected(normal)
+        return out if decision is None else {**out, "goodness_of_fit": decision}
+
+
+def study(
+    values: ArrayLike,
+    groups: Sequence[object] | NDArray[Any] | None = None,
+    sigmas: ArrayLike | None = None,
+    redundancy: ArrayLike | None = None,
+    options: StudyOptions | None = None,
+    *,
+    group_names: Sequence[str] = (),
+    residuals_of: ResidualsOf | None = None,
+) -> ResidualStudy:
+    """Study a column of residuals.
+
+    Parameters
+    ----------
+    values : (n,) array
+        Residuals, n at least 3, in one unit (in the units of their sigmas where these are given).
+    groups : (n,) sequence, optional
+        Group of each residual: labels, or codes into `group_names`.
+    sigmas : (n,) array, optional
+        A-priori standard deviations of the observations, positive.
+    redundancy : (n,) array, optional
+        Redundancy numbers r_i, 0 to 1; observations are taken as uncorrelated.
+    options : StudyOptions, optional
+    group_names : sequence of str
+        Names of the groups, when `groups` are codes.
+    residuals_of : callable, optional
+        Maps errors of unit variance, (n, B), to residuals standardised as the values studied are; see `study_laws`.
+
+    Returns
+    -------
+    ResidualStudy
+
+    Raises
+    ------
+    UsageError
+        If columns are too short, of different lengths, not finite or constant, sigmas not positive, redundancy numbers outside [0, 1],
+        or classes do not cover the values.
+
+    Notes
+    -----
+    Maarek & Konecny, Modulated normal distribution. Of their scale rules S_o (v'v over the redundancy, on raw residuals) is described
+    only: raw residuals have variance r_i sigma^2, and the rule rejects truly normal errors in about half of all cases.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(5)
+    >>> found = study(7.0 * rng.standard_normal(200), options=StudyOptions(laws=("normal", "lineo"), replicas=199))
+    >>> found.kind, found.gates
+    ('raw', {'mean_of_residuals': False, 'goodness_of_fit': False})
+    """
+    o = StudyOptions() if options is None else options
+    v = _column(values, "residuals")
+    n = len(v)
+    if n < LEAST:
+        raise UsageError(f"{n} residuals given: at least {LEAST} are needed")
+    if np.ptp(v) == 0.0:
+        raise UsageError(f"all {n} residuals are equal ({v[0]:g}): nothing can be tested")
+    given = None if sigmas is None else _sigmas(sigmas, n)
+    r = None if redundancy is None else _redundancy(redundancy, n)
+    codes, names = (None, ()) if groups is None else _coded(groups, group_names, n)
+    kept = np.ones(n, dtype=bool) if r is None else r >= UNCONTROLLED
+    base = v[kept] if given is None else v[kept] / given[kept]
+    if len(base) < LEAST:
+        raise UsageError(f"{len(base)} residuals are controlled by other observations (redundancy number above 1e-10): 3 are needed")
+    own = None if r is None else r[kept]
+    total, sigma0, x = _standardised(base, own)
+    _spread(x)
+    kind: Kind = "standardised" if own is not None else "raw" if given is None else "weighted"
+    tests, left_out = _tests(x, base, total if given is not None else None, o)
+    grouped = None
+    if codes is not None:
+        grouped, why = _groups(codes[kept], names, base, x, own, o)
+        left_out += why
+    rules, why = _scale_rules(base, x if own is not None else None, total, o)
+    left_out += why
+    # Class limits are given in the unit of the residuals; standardised ones have their own.
+    for_laws = replace(o, classes="equal_width", ends="open") if own is not None and not isinstance(o.classes, str) else o
+    laws = study_laws(x, for_laws, residuals_of)
+    x.flags.writeable = base.flags.writeable = False
+    d = (x - x.mean()) / x.std()
+    return ResidualStudy(
+        o,
+        x,
+        kind,
+        base,
+        n - len(base),
+        float(x.mean()),
+        float(x.std(ddof=1)),
+        float(np.mean(d**3)),
+        float(np.mean(d**4)),
+        total,
+        sigma0,
+        tests,
+        grouped,
+        rules,
+        laws,
+        _a_of_errors(laws, own),
+        (*left_out, *laws.left_out),
+    )
+
+
+def _column(values: ArrayLike, what: str) -> Floats:
+    try:
+        x = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        raise UsageError(f"the {what} are not numbers") from None
+    if x.ndim != 1:
+        raise UsageError(f"the {what} must be one column, not an array of shape {x.shape}")
+    bad = np.flatnonzero(~np.isfinite(x))
+    if len(bad):
+        raise UsageError(f"{len(bad)} of {len(x)} {what} are not finite; the first is number {bad[0] + 1} ({x[bad[0]]})")
+    return x
+
+
+def _same_length(x: Floats, n: int, what: str) -> Floats:
+    if len(x) != n:
+        raise UsageError(f"{len(x)} {what} for {n} residuals")
+    return x
+
+
+def _sigmas(sigmas: ArrayLike, n: int) -> Floats:
+    x = _same_length(_column(sigmas, "sigmas"), n, "sigmas")
+    bad = np.flatnonzero(x <= 0.0)
+    if len(bad):
+        raise UsageError(f"sigmas must be positive; number {bad[0] + 1} is {x[bad[0]]:g}")
+    return x
+
+
+def _redundancy(redundancy: ArrayLike, n: int) -> Floats:
+    x = _same_length(_column(redundancy, "redundancy numbers"), n, "redundancy numbers")
+    bad = np.flatnonzero((x < -_ROUNDING) | (x > 1.0 + _ROUNDING))
+    if len(bad):
+        raise UsageError(f"redundancy numbers lie between 0 and 1; number {bad[0] + 1} is {x[bad[0]]:g}")
+    return x
+
+
+def _coded(groups: Sequence[object] | NDArray[Any], names: Sequence[str], n: int) -> tuple[Ints, tuple[str, ...]]:
+    """Return codes and names of groups, in the order of their first appearance when they come as labels."""
+    if len(groups) != n:
+        raise UsageError(f"{len(groups)} groups for {n} residuals")
+    if names:
+        codes = np.asarray(groups)
+        if codes.dtype.kind not in "iu" or (n and (codes.min() < 0 or codes.max() >= len(names))):
+            raise UsageError(f"codes of groups are integers from 0 to {len(names) - 1}")
+        return codes.astype(np.intp), tuple(names)
+    index: dict[str, int] = {}
+    coded = np.array([index.setdefault(str(g), len(index)) for g in groups], dtype=np.intp)
+    return coded, tuple(index)
+
+
+def _standardised(base: Floats, r: Floats | None) -> tuple[float | None, float | None, Floats]:
+    """Return the redundancy, s0, and the residuals divided by their own standard deviations; the residuals as they are without r."""
+    if r is None:
+        return None, None, base.copy()
+    total = float(r.sum())
+    with np.errstate(over="ignore", under="ignore"):
+        sigma0 = float(np.sqrt(base @ base / total))
+    if not 0.0 < sigma0 < np.inf:
+        raise UsageError("the residuals are too small or too large for squares to be formed: choose another unit")
+    return total, sigma0, base / (sigma0 * np.sqrt(r))
+
+
+def _spread(x: Floats) -> None:
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        fourth = float(np.mean((x - x.mean()) ** 4))
+    if np.ptp(x) == 0.0:
+        raise UsageError("all standardised residuals are equal: nothing can be tested")
+    if not 0.0 < fourth < np.inf:
+        raise UsageError("the residuals are too small or too large for their moments to be formed: choose another unit")
+
+
+def _tests(x: Floats, base: Floats, total: float | None, o: StudyOptions) -> tuple[tuple[TestResult, ...], list[tuple[str, str]]]:
+    """Global test and moments; `total` is given where sigmas are."""
+    note = "Law for independent values of equal variance: approximate for residuals of an adjustment."
+    out: list[TestResult] = []
+    left_out: list[tuple[str, str]] = []
+    if total is not None and len(base):
+        whole = global_variance_factor(float(base @ base), total, alpha=o.alpha)
+        said = "r is the sum of the redundancy numbers of the table, which must hold all observations of the adjustment."
+        out.append(replace(whole, note=said))
+    centred = x if o.loc is None else x - o.loc
+    for test, least, what in (
+        (mean_of_residuals, 2, "mean"),
+        (skewness_of_residuals, 8, "skewness"),
+        (kurtosis_of_residuals, 20, "kurtosis"),
+    ):
+        if len(x) >= least:
+            out.append(test(centred, o.alpha, note=note))
+        else:
+            left_out.append((f"test of the {what}", f"it needs at least {least} values"))
+    return tuple(out), left_out
+
+
+def _groups(
+    codes: Ints, names: tuple[str, ...], base: Floats, x: Floats, r: Floats | None, o: StudyOptions
+) -> tuple[Groups, list[tuple[str, str]]]:
+    k = len(names)
+    counts = np.bincount(codes, minlength=k)
+    some = np.maximum(counts, 1)
+    means = np.bincount(codes, base, k) / some
+    if r is None:
+        sums, df = np.bincount(codes, (base - means[codes]) ** 2, k), counts - 1.0
+    else:
+        sums, df = np.bincount(codes, base**2, k), np.bincount(codes, r, k)
+    usable = df > UNCONTROLLED
+    variances = np.divide(sums, df, out=np.full(k, np.nan), where=usable)
+    means = np.where(counts > 0, means, np.nan)
+    made = Groups(names, codes, counts, means, variances, df, r is not None)
+    left_out: list[tuple[str, str]] = []
+    if not usable.all():
+        lost = [names[i] for i in np.flatnonzero(~usable)]
+        left_out.append((f"variance of {len(lost)} of {k} groups", f"no degree of freedom: {_some(lost)}"))
+    flat = np.flatnonzero(usable & (variances == 0.0))
+    if len(flat):
+        left_out.append(("homogeneity of variances", f"all residuals are equal in {_some([names[i] for i in flat])}"))
+        return made, left_out
+    at = np.flatnonzero(usable)
+    if len(at) < 2:
+        left_out.append(("homogeneity of variances", "it needs two groups with degrees of freedom"))
+        return made, left_out
+    return replace(made, tests=_homogeneity(made, at, x, o)), left_out
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+def _homogeneity(groups: Groups, at: Ints, x: Floats, o: StudyOptions) -> tuple[TestResult, ...]:
+    s2, df = groups.variances[at], groups.df[at]
+    common = bartlett(s2, df, o.alpha)
+    theirs = bartlett(s2, df, o.alpha, corrected=False)
+    each = variance_per_image(s2, df, None, o.alpha, o.levels, [groups.names[i] for i in at])
+    said = "Exact for normal residuals of groups that were adjusted separately; modulated errors make it reject too often."
+    if groups.by_redundancy:
+        said += " Groups of one adjustment share unknowns: approximate."
+    out = [
+        replace(common, note=f"{said} {common.note}".strip()),
+        replace(theirs, name="bartlett_uncorrected", note="The form of Maarek & Konecny, without Bartlett's correction."),
+        replace(each, name="variance_per_group", note=f"{said} {each.note}".strip()),
+    ]
+    robust = _brown_forsythe(x, groups.codes, len(groups.names), o.alpha)
+    return (*out, robust) if robust is not None else tuple(out)
+
+
+def _brown_forsythe(x: Floats, codes: Ints, k: int, alpha: float) -> TestResult | None:
+    """Analysis of variance of the distances from the group's median: homogeneity without a normal law.
+
+    M. B. Brown, A. B. Forsythe, J. Am. Stat. Ass. 69 (1974) 364-367.
+    """
+    order = np.lexsort((x, codes))
+    counts = np.bincount(codes, minlength=k)
+    full = np.flatnonzero(counts)
+    if len(full) < 2 or len(x) <= len(full):
+        return None
+    starts = (np.cumsum(counts) - counts)[full]
+    low, high = starts + (counts[full] - 1) // 2, starts + counts[full] // 2
+    medians = np.zeros(k)
+    medians[full] = 0.5 * (x[order[low]] + x[order[high]])
+    z = np.abs(x - medians[codes])
+    means = np.bincount(codes, z, k) / np.maximum(counts, 1)
+    within = float(np.sum((z - means[codes]) ** 2))
+    if within == 0.0:
+        return None
+    between = float(np.sum(counts * (means - z.mean()) ** 2))
+    df = (len(full) - 1, len(x) - len(full))
+    return TestResult(
+        "brown_forsythe",
+        "All groups have the same spread, whatever their law.",
+        between / df[0] / (within / df[1]),
+        stats.f(*df),
+        f"F({df[0]}, {df[1]})",
+        alpha,
+        df=(float(df[0]), float(df[1])),
+        note="Analysis of variance of the distances from the medians of the groups: does not lean on the normal law.",
+    )
+
+
+def _scale_rules(
+    base: Floats, standardised: Floats | None, total: float | None, o: StudyOptions
+) -> tuple[tuple[ScaleRule, ...], list[tuple[str, str]]]:
+    """The normal law with the paper's four scales, on the same classes (Q_v on classes of its own values)."""
+    n = len(base)
+    mean = float(base.mean()) if o.loc is None else o.loc
+    squares = float(np.sum((base - mean) ** 2))
+    used = 1 if o.loc is None else 0
+    sample = float(np.sqrt(squares / (n - used)))
+    try:
+        edges: Floats | None = class_limits(base, o)
+    except UsageError as error:
+        if not isinstance(o.classes, str):
+            raise
+        edges = None
+        why = [("scale rules on classes", str(error))]
+    rules = [ScaleRule("sample", "S_M", mean, sample, _judged(base, edges, mean, sample, used + 1, o))]
+    if total is not None and total > used:
+        deviation = float(np.sqrt(squares / (total - used)))
+        judged = _judged(base, edges, mean, deviation, used + 1, o)
+        rules.append(ScaleRule("redundancy", "S_o", mean, deviation, judged, described=True))
+    if standardised is not None:
+        own = o if isinstance(o.classes, str) else replace(o, classes="equal_width", ends="open")
+        try:
+            limits: Floats | None = class_limits(standardised, own)
+        except UsageError:
+            limits = None
+        rules.append(ScaleRule("standardised", "Q_v", 0.0, 1.0, _judged(standardised, limits, 0.0, 1.0, 1, own)))
+    if edges is None:
+        return tuple(rules), why
+    if len(edges) < used + 3:  # classes - 1 - estimated parameters must leave something to minimise
+        return tuple(rules), [("minimum chi-square", f"{len(edges) - 1} classes are too few")]
+    counts = count(base, edges, o.ends)
+    least = fit_classes(counts, edges, "normal", rule="minimum_chi2", loc=o.loc, ends=o.ends, alpha=o.alpha)
+    rules.append(ScaleRule("minimum_chi2", "S_P", least.parameters["loc"], least.parameters["scale"], least))
+    return tuple(rules), []
+
+
+def _judged(x: Floats, edges: Floats | None, mean: float, deviation: float, estimated: int, o: StudyOptions) -> Fit | None:
+    if edges is None:
+        return None
+    try:
+        return fit_classes(
+            count(x, edges, o.ends), edges, "normal", loc=mean, scale=deviation, ends=o.ends, estimated=estimated, alpha=o.alpha
+        )
+    except UsageError:  # a class that the law cannot reach: no chi-square with these numbers
+        return None
+
+
+def _a_of_errors(laws: LawsStudied, r: Floats | None) -> float | None:
+    """The a of the errors from the a of the residuals: excess kurtosis of v_i = that of e times sum_j R_ij^4 / R_ii^2, about r_i^2."""
+    if r is None or laws.modulated is None:
+        return None
+    a = laws.modulated.parameters["a"]
+    excess = (0.0 if np.isinf(a) else 3.0 / ((a + 1.0) * (a + 3.0))) / float(np.mean(r**2))
+    return float("inf") if excess == 0.0 else float(np.sqrt((3.0 + excess) / excess) - 2.0)
