@@ -4,7 +4,6 @@ import csv
 
 import numpy as np
 import pytest
-from networks import control_table
 
 import baarda
 from baarda import cameras
@@ -15,6 +14,7 @@ from baarda.geometry.rotation import exp
 from baarda.hypotheses.outliers import tau
 from baarda.network import CONTROL, Images, Network, Points
 from baarda.observations import ImagePoints
+from networks import control_table
 
 OPENCV = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 

@@ -40,7 +40,7 @@ def test_a_of_the_residuals_is_another(made):
     expected = truth(0.5) * made.dilution()
     spread = fourth.std(ddof=1) / np.sqrt(4000)
     assert abs(fourth.mean() - expected) <= 4.0 * spread
-    assert truth(0.5) - fourth.mean() > 20.0 * spread
+    assert truth(0.5) - fourth.mean() > 10.0 * spread
     assert a_of_kurtosis(fourth.mean()) == pytest.approx(0.95, abs=0.06)
 
 

@@ -96,7 +96,7 @@ def _tests(made: Study) -> Comparison:
             rows.append(row((test.name, test.null), truth[test.name], _word(bool(test.rejected)), 2, SAMPLE))
     note = (
         "Residuals divided by their own standard deviations; null laws by simulated normal errors through the 19 resections. The mean of "
-        "raw V cannot be tested: the shifts of the camera make it zero (1'Qvv1 = 0)."
+        "raw V cannot be tested: the shifts of the camera make it zero (1'Qvv1 is nearly 0)."
     )
     return Comparison("study-tests", "The study: tests through Q_v", ("test", "quantity"), tuple(rows), note, ("true", "found"))
 
@@ -197,6 +197,7 @@ def report(made: Study, replicas: int = 2000) -> tuple[tuple[Comparison, ...], t
 
     Examples
     --------
+    >>> from baarda.papers.maarek_konecny_study import study
     >>> tables, figures, said = report(study(), replicas=100)
     >>> [t.table for t in tables]
     ['study-sets', 'study-laws', 'study-tests', 'study-a', 'study-rule']

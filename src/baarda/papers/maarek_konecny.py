@@ -421,8 +421,7 @@ def reproduce() -> Reproduction:
 
     Examples
     --------
-    >>> made = reproduce()
-    >>> made.comparison("table-4").value("normal S_P", "629 values, closed", "chi-square")
+    >>> _table_4(_v_fits()).value("normal S_P", "629 values, closed", "chi-square")
     14.39
     """
     from baarda.papers._maarek_konecny_study_report import report

@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
 from baarda.distributions.base import Floats
 from baarda.distributions.class_fitting import fit_classes
@@ -16,54 +15,15 @@ from baarda.distributions.fitting import Fit
 from baarda.distributions.histogram import count
 from baarda.errors import UsageError
 from baarda.hypotheses.base import TestResult
-from baarda.hypotheses.homogeneity import bartlett, variance_per_image
 from baarda.hypotheses.moments import kurtosis_of_residuals, mean_of_residuals, skewness_of_residuals
 from baarda.hypotheses.variance_factor import global_variance_factor
+from baarda.procedures.group_study import UNCONTROLLED, Groups, coded, study_groups
 from baarda.procedures.law_study import LawsStudied, ResidualsOf, StudyOptions, class_limits, study_laws
 
 LEAST = 3
-UNCONTROLLED = 1e-10  # a residual whose redundancy number is below is zero by construction
 _ROUNDING = 1e-9  # of redundancy numbers that another program printed
 
 Kind = Literal["raw", "weighted", "standardised"]
-Ints = NDArray[np.intp]
-
-
-@dataclass(frozen=True)
-class Groups:
-    """The groups of the values and the variance of each.
-
-    Attributes
-    ----------
-    names : tuple of str
-    codes : (n,) integer array
-        Group of each controlled value.
-    counts, means, variances, df : (k,) arrays
-        Of the (weighted) residuals. The variance is that about the group's mean with n_g - 1 degrees of freedom, or, where redundancy
-        numbers are given, v'Pv / r_g with r_g their sum; NaN without any.
-    by_redundancy : bool
-        Which of the two.
-    tests : tuple of TestResult
-        Bartlett (corrected), Bartlett as the paper has it, each group against the pooled variance, Brown-Forsythe; as far as they apply.
-    """
-
-    names: tuple[str, ...]
-    codes: Ints
-    counts: Ints
-    means: Floats
-    variances: Floats
-    df: Floats
-    by_redundancy: bool
-    tests: tuple[TestResult, ...] = ()
-
-    @property
-    def tested(self) -> Ints:
-        """Indices of the groups that have degrees of freedom and a variance."""
-        return np.flatnonzero((self.df > UNCONTROLLED) & (self.variances > 0.0))
-
-    def test(self, name: str) -> TestResult | None:
-        """Return the test of this name."""
-        return next((t for t in self.tests if t.name == name), None)
 
 
 @dataclass(frozen=True)
@@ -217,7 +177,7 @@ def study(
 
     Examples
     --------
-    >>> rng = np.random.default_rng(5)
+    >>> rng = np.random.default_rng(2)
     >>> found = study(7.0 * rng.standard_normal(200), options=StudyOptions(laws=("normal", "lineo"), replicas=199))
     >>> found.kind, found.gates
     ('raw', {'mean_of_residuals': False, 'goodness_of_fit': False})
@@ -227,13 +187,18 @@ def study(
     n = len(v)
     if n < LEAST:
         raise UsageError(f"{n} residuals given: at least {LEAST} are needed")
-    if np.ptp(v) == 0.0:
+    if v.min() == v.max():
         raise UsageError(f"all {n} residuals are equal ({v[0]:g}): nothing can be tested")
     given = None if sigmas is None else _sigmas(sigmas, n)
     r = None if redundancy is None else _redundancy(redundancy, n)
-    codes, names = (None, ()) if groups is None else _coded(groups, group_names, n)
+    codes, names = (None, ()) if groups is None else coded(groups, group_names, n)
     kept = np.ones(n, dtype=bool) if r is None else r >= UNCONTROLLED
-    base = v[kept] if given is None else v[kept] / given[kept]
+    if o.loc and (given is not None or r is not None):
+        raise UsageError(f"loc = {o.loc:g} has no meaning for weighted residuals: only 0 has")
+    with np.errstate(over="ignore", under="ignore"):
+        base = v[kept] if given is None else v[kept] / given[kept]
+    if not np.isfinite(base).all():
+        raise UsageError("a residual divided by its sigma is too large a number")
     if len(base) < LEAST:
         raise UsageError(f"{len(base)} residuals are controlled by other observations (redundancy number above 1e-10): 3 are needed")
     own = None if r is None else r[kept]
@@ -243,7 +208,7 @@ def study(
     tests, left_out = _tests(x, base, total if given is not None else None, o)
     grouped = None
     if codes is not None:
-        grouped, why = _groups(codes[kept], names, base, x, own, o)
+        grouped, why = study_groups(codes[kept], names, base, x, own, o)
         left_out += why
     rules, why = _scale_rules(base, x if own is not None else None, total, o)
     left_out += why
@@ -308,20 +273,6 @@ def _redundancy(redundancy: ArrayLike, n: int) -> Floats:
     return x
 
 
-def _coded(groups: Sequence[object] | NDArray[Any], names: Sequence[str], n: int) -> tuple[Ints, tuple[str, ...]]:
-    """Return codes and names of groups, in the order of their first appearance when they come as labels."""
-    if len(groups) != n:
-        raise UsageError(f"{len(groups)} groups for {n} residuals")
-    if names:
-        codes = np.asarray(groups)
-        if codes.dtype.kind not in "iu" or (n and (codes.min() < 0 or codes.max() >= len(names))):
-            raise UsageError(f"codes of groups are integers from 0 to {len(names) - 1}")
-        return codes.astype(np.intp), tuple(names)
-    index: dict[str, int] = {}
-    coded = np.array([index.setdefault(str(g), len(index)) for g in groups], dtype=np.intp)
-    return coded, tuple(index)
-
-
 def _standardised(base: Floats, r: Floats | None) -> tuple[float | None, float | None, Floats]:
     """Return the redundancy, s0, and the residuals divided by their own standard deviations; the residuals as they are without r."""
     if r is None:
@@ -335,10 +286,10 @@ def _standardised(base: Floats, r: Floats | None) -> tuple[float | None, float |
 
 
 def _spread(x: Floats) -> None:
+    if x.min() == x.max():
+        raise UsageError("all residuals divided by their standard deviations are equal: nothing can be tested")
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         fourth = float(np.mean((x - x.mean()) ** 4))
-    if np.ptp(x) == 0.0:
-        raise UsageError("all standardised residuals are equal: nothing can be tested")
     if not 0.0 < fourth < np.inf:
         raise UsageError("the residuals are too small or too large for their moments to be formed: choose another unit")
 
@@ -365,90 +316,6 @@ def _tests(x: Floats, base: Floats, total: float | None, o: StudyOptions) -> tup
     return tuple(out), left_out
 
 
-def _groups(
-    codes: Ints, names: tuple[str, ...], base: Floats, x: Floats, r: Floats | None, o: StudyOptions
-) -> tuple[Groups, list[tuple[str, str]]]:
-    k = len(names)
-    counts = np.bincount(codes, minlength=k)
-    some = np.maximum(counts, 1)
-    means = np.bincount(codes, base, k) / some
-    if r is None:
-        sums, df = np.bincount(codes, (base - means[codes]) ** 2, k), counts - 1.0
-    else:
-        sums, df = np.bincount(codes, base**2, k), np.bincount(codes, r, k)
-    usable = df > UNCONTROLLED
-    variances = np.divide(sums, df, out=np.full(k, np.nan), where=usable)
-    means = np.where(counts > 0, means, np.nan)
-    made = Groups(names, codes, counts, means, variances, df, r is not None)
-    left_out: list[tuple[str, str]] = []
-    if not usable.all():
-        lost = [names[i] for i in np.flatnonzero(~usable)]
-        left_out.append((f"variance of {len(lost)} of {k} groups", f"no degree of freedom: {_some(lost)}"))
-    flat = np.flatnonzero(usable & (variances == 0.0))
-    if len(flat):
-        left_out.append(("homogeneity of variances", f"all residuals are equal in {_some([names[i] for i in flat])}"))
-        return made, left_out
-    at = np.flatnonzero(usable)
-    if len(at) < 2:
-        left_out.append(("homogeneity of variances", "it needs two groups with degrees of freedom"))
-        return made, left_out
-    return replace(made, tests=_homogeneity(made, at, x, o)), left_out
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-
-
-def _homogeneity(groups: Groups, at: Ints, x: Floats, o: StudyOptions) -> tuple[TestResult, ...]:
-    s2, df = groups.variances[at], groups.df[at]
-    common = bartlett(s2, df, o.alpha)
-    theirs = bartlett(s2, df, o.alpha, corrected=False)
-    each = variance_per_image(s2, df, None, o.alpha, o.levels, [groups.names[i] for i in at])
-    said = "Exact for normal residuals of groups that were adjusted separately; modulated errors make it reject too often."
-    if groups.by_redundancy:
-        said += " Groups of one adjustment share unknowns: approximate."
-    out = [
-        replace(common, note=f"{said} {common.note}".strip()),
-        replace(theirs, name="bartlett_uncorrected", note="The form of Maarek & Konecny, without Bartlett's correction."),
-        replace(each, name="variance_per_group", note=f"{said} {each.note}".strip()),
-    ]
-    robust = _brown_forsythe(x, groups.codes, len(groups.names), o.alpha)
-    return (*out, robust) if robust is not None else tuple(out)
-
-
-def _brown_forsythe(x: Floats, codes: Ints, k: int, alpha: float) -> TestResult | None:
-    """Analysis of variance of the distances from the group's median: homogeneity without a normal law.
-
-    M. B. Brown, A. B. Forsythe, J. Am. Stat. Ass. 69 (1974) 364-367.
-    """
-    order = np.lexsort((x, codes))
-    counts = np.bincount(codes, minlength=k)
-    full = np.flatnonzero(counts)
-    if len(full) < 2 or len(x) <= len(full):
-        return None
-    starts = (np.cumsum(counts) - counts)[full]
-    low, high = starts + (counts[full] - 1) // 2, starts + counts[full] // 2
-    medians = np.zeros(k)
-    medians[full] = 0.5 * (x[order[low]] + x[order[high]])
-    z = np.abs(x - medians[codes])
-    means = np.bincount(codes, z, k) / np.maximum(counts, 1)
-    within = float(np.sum((z - means[codes]) ** 2))
-    if within == 0.0:
-        return None
-    between = float(np.sum(counts * (means - z.mean()) ** 2))
-    df = (len(full) - 1, len(x) - len(full))
-    return TestResult(
-        "brown_forsythe",
-        "All groups have the same spread, whatever their law.",
-        between / df[0] / (within / df[1]),
-        stats.f(*df),
-        f"F({df[0]}, {df[1]})",
-        alpha,
-        df=(float(df[0]), float(df[1])),
-        note="Analysis of variance of the distances from the medians of the groups: does not lean on the normal law.",
-    )
-
-
 def _scale_rules(
     base: Floats, standardised: Floats | None, total: float | None, o: StudyOptions
 ) -> tuple[tuple[ScaleRule, ...], list[tuple[str, str]]]:
@@ -457,44 +324,49 @@ def _scale_rules(
     mean = float(base.mean()) if o.loc is None else o.loc
     squares = float(np.sum((base - mean) ** 2))
     used = 1 if o.loc is None else 0
-    sample = float(np.sqrt(squares / (n - used)))
+    left_out: list[tuple[str, str]] = []
+    edges = _limits(base, o, left_out)
+    rules = []
+    for name, symbol, r in (("sample", "S_M", float(n)), ("redundancy", "S_o", total or 0.0)):
+        if r > used:
+            deviation = float(np.sqrt(squares / (r - used)))
+            judged = _judged(base, edges, mean, deviation, used + 1, o, left_out)
+            rules.append(ScaleRule(name, symbol, mean, deviation, judged, described=name == "redundancy"))
+    if standardised is not None:
+        own = o if isinstance(o.classes, str) else replace(o, classes="equal_width", ends="open")
+        limits = _limits(standardised, own, left_out)
+        rules.append(ScaleRule("standardised", "Q_v", 0.0, 1.0, _judged(standardised, limits, 0.0, 1.0, 1, own, left_out)))
+    if edges is not None and len(edges) - 2 > used:  # classes - 1 - estimated parameters must leave something to minimise
+        counts = count(base, edges, o.ends)
+        least = fit_classes(counts, edges, "normal", rule="minimum_chi2", loc=o.loc, ends=o.ends, alpha=o.alpha)
+        rules.append(ScaleRule("minimum_chi2", "S_P", least.parameters["loc"], least.parameters["scale"], least))
+    elif edges is not None:
+        left_out.append(("minimum chi-square", f"{len(edges) - 1} classes are too few"))
+    return tuple(rules), left_out
+
+
+def _limits(x: Floats, o: StudyOptions, left_out: list[tuple[str, str]]) -> Floats | None:
     try:
-        edges: Floats | None = class_limits(base, o)
+        return class_limits(x, o)
     except UsageError as error:
         if not isinstance(o.classes, str):
             raise
-        edges = None
-        why = [("scale rules on classes", str(error))]
-    rules = [ScaleRule("sample", "S_M", mean, sample, _judged(base, edges, mean, sample, used + 1, o))]
-    if total is not None and total > used:
-        deviation = float(np.sqrt(squares / (total - used)))
-        judged = _judged(base, edges, mean, deviation, used + 1, o)
-        rules.append(ScaleRule("redundancy", "S_o", mean, deviation, judged, described=True))
-    if standardised is not None:
-        own = o if isinstance(o.classes, str) else replace(o, classes="equal_width", ends="open")
-        try:
-            limits: Floats | None = class_limits(standardised, own)
-        except UsageError:
-            limits = None
-        rules.append(ScaleRule("standardised", "Q_v", 0.0, 1.0, _judged(standardised, limits, 0.0, 1.0, 1, own)))
-    if edges is None:
-        return tuple(rules), why
-    if len(edges) < used + 3:  # classes - 1 - estimated parameters must leave something to minimise
-        return tuple(rules), [("minimum chi-square", f"{len(edges) - 1} classes are too few")]
-    counts = count(base, edges, o.ends)
-    least = fit_classes(counts, edges, "normal", rule="minimum_chi2", loc=o.loc, ends=o.ends, alpha=o.alpha)
-    rules.append(ScaleRule("minimum_chi2", "S_P", least.parameters["loc"], least.parameters["scale"], least))
-    return tuple(rules), []
+        reason = ("scale rules on classes", str(error))
+        if reason not in left_out:
+            left_out.append(reason)
+        return None
 
 
-def _judged(x: Floats, edges: Floats | None, mean: float, deviation: float, estimated: int, o: StudyOptions) -> Fit | None:
+def _judged(
+    x: Floats, edges: Floats | None, mean: float, deviation: float, estimated: int, o: StudyOptions, left_out: list[tuple[str, str]]
+) -> Fit | None:
     if edges is None:
         return None
+    counts = count(x, edges, o.ends)
     try:
-        return fit_classes(
-            count(x, edges, o.ends), edges, "normal", loc=mean, scale=deviation, ends=o.ends, estimated=estimated, alpha=o.alpha
-        )
-    except UsageError:  # a class that the law cannot reach: no chi-square with these numbers
+        return fit_classes(counts, edges, "normal", loc=mean, scale=deviation, ends=o.ends, estimated=estimated, alpha=o.alpha)
+    except UsageError as error:
+        left_out.append(("chi-square of a scale rule", str(error)))
         return None
 
 

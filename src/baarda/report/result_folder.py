@@ -224,11 +224,11 @@ def check_target(target: Path) -> None:
     OutputError
         See `whole_folder`.
     """
-    _temporary(target).rmdir()
+    _temporary(target.absolute()).rmdir()
 
 
 def _temporary(target: Path) -> Path:
-    """Make a temporary folder beside the target."""
+    """Make a temporary folder beside the (absolute) target."""
     try:
         if target.exists() and not (target.is_dir() and (not any(target.iterdir()) or (target / "result.json").is_file())):
             raise OutputError(f"{target} exists and is not a result folder: choose another --out")
@@ -247,6 +247,7 @@ def whole_folder(target: Path) -> Iterator[Path]:
     OutputError
         If the target is a file or a folder that this program did not write, or if writing fails.
     """
+    target = target.absolute()
     temporary = _temporary(target)
     try:
         yield temporary

@@ -20,7 +20,7 @@ from baarda.report.sections._facts import (
     shares,
     spatial,
 )
-from baarda.report.sections._numbers import finer, fixed, names, plural, significant
+from baarda.report.sections._numbers import finer, fixed, names, plural, probability, significant
 from baarda.report.sections.base import Block, Cell, Column, DataTable, Items, Paragraph, SectionMaker, Tone, say
 from baarda.report.sections.verdict import within_chance
 
@@ -256,11 +256,16 @@ def _survey(analysis: Analysis) -> Iterator[Problem]:
 
 def _law(analysis: Analysis) -> Iterator[Problem]:
     normal = next((f for f in analysis.laws if f.law == "normal"), None)
-    kurtosis = result_of(analysis, "kurtosis_of_residuals")
-    if normal is None or not normal.rejected:
+    kurtosis, simulated = result_of(analysis, "kurtosis_of_residuals"), result_of(analysis, "goodness_of_fit")
+    rejected = simulated.rejected if simulated is not None else normal is not None and normal.rejected
+    if not rejected:
         return
     k = None if kurtosis is None else float(kurtosis.details["kurtosis"])
-    evidence = say("chi-square {chi}, limit {limit}", chi=fixed(normal.statistic, 1), limit=fixed(normal.critical, 1))
+    if simulated is not None:
+        value, p = fixed(float(simulated.statistic), 2), probability(float(simulated.p_value))
+        evidence = say("Anderson-Darling {value}, p = {p}", value=value, p=p)
+    else:
+        evidence = say("chi-square {chi}", chi=fixed(0.0 if normal is None else normal.statistic, 1))
     evidence += "" if k is None else say("; kurtosis {k} (normal law: 3)", k=fixed(k, 2))
     advice = (
         "Heavier tails than the normal law: gross errors, or observations of different precision mixed under one sigma. Remove errors, "
@@ -268,7 +273,7 @@ def _law(analysis: Analysis) -> Iterator[Problem]:
         if k is None or k > 3.0
         else "Lighter tails than the normal law: rounded or filtered measurements, or an automatic rejection before the adjustment."
     )
-    yield "warn", "The residuals do not follow the normal law.", evidence, advice + " Levels of the tests are approximate."
+    yield "warn", "The residuals are not those of normal errors.", evidence, advice + " Levels of the tests are approximate."
 
 
 _CHECKS: tuple[Callable[[Analysis], Iterator[Problem]], ...] = (

@@ -311,29 +311,34 @@ def _law(analysis: Analysis) -> Sentence | None:
     if normal is None or normal.statistic is None or normal.critical is None:
         return None
     best = min(laws, key=lambda f: f.aic if f.aic is not None else np.inf)
-    fields = {
-        "chi": fixed(normal.statistic, 1),
-        "limit": fixed(normal.critical, 1),
-        "p": _p_word(normal.p_value),
-        "best": law_name(best.law, best.parameters.get("a")),
-    }
-    tone: Tone = "warn" if normal.rejected else "good"
-    if not normal.rejected:
-        text = "The standardised residuals do not contradict the normal law (chi-square {chi}, limit {limit}, p {p})."
-        if best.law != "normal":
-            text += " The {best} has the better AIC, but not by enough to reject the normal."
-    elif best.law == "normal":
-        text = (
-            "The standardised residuals do not follow the normal law (chi-square {chi}, limit {limit}, p {p}); no other law tried fits "
-            "better."
+    simulated = result_of(analysis, "goodness_of_fit")
+    rejected = bool(normal.rejected if simulated is None else simulated.rejected)
+    if simulated is None:
+        test = say(
+            "chi-square {chi}, limit {limit}, p {p} for independent values",
+            chi=fixed(normal.statistic, 1),
+            limit=fixed(normal.critical, 1),
+            p=_p_word(normal.p_value),
         )
     else:
-        text = (
-            "The standardised residuals do not follow the normal law (chi-square {chi}, limit {limit}, p {p}); of the laws tried the "
-            "{best} fits "
-            "best by AIC" + (", though it is rejected too." if best.rejected else ".")
+        test = say(
+            "Anderson-Darling {value}, limit {limit}, p {p} by simulated adjustments",
+            value=fixed(float(simulated.statistic), 2),
+            limit=fixed(_upper(simulated.critical), 2),
+            p=_p_word(float(simulated.p_value)),
         )
-    return Sentence("Law of residuals", say(text, **fields), tone, "law")
+    if not rejected:
+        text = "The residuals do not contradict normal errors ({test})."
+        if best.law != "normal":
+            text += " The {best} has the better AIC, but not by enough to reject the normal law."
+    elif best.law == "normal":
+        text = "The residuals are not those of normal errors ({test}); no other law tried fits them better."
+    else:
+        text = "The residuals are not those of normal errors ({test}); of the laws tried the {best} fits best by AIC" + (
+            ", though its chi-square rejects it too." if best.rejected else "."
+        )
+    tone: Tone = "warn" if rejected else "good"
+    return Sentence("Law of residuals", say(text, test=test, best=law_name(best.law, best.parameters.get("a"))), tone, "law")
 
 
 def _p_word(p: float | None) -> str:
