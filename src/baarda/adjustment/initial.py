@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from baarda.cameras import Optics
 from baarda.errors import BaardaError, Singular, UsageError
 from baarda.geometry.intersection import PointStatus, intersect
-from baarda.geometry.relative_orientation import relative_orientation
+from baarda.geometry.relative_orientation import RelativeOrientation, relative_orientation
 from baarda.geometry.resection import resect
 from baarda.geometry.similarity import similarity
 from baarda.network import Network
@@ -95,7 +95,6 @@ class _Search:
         self.image, self.point, self.xy, self.sigma = self.image[valid], self.point[valid], self.xy[valid], self.sigma[valid]
         self.oriented, self.known = oriented.copy(), known.copy()
         self.fixed_frame = bool(known.any() or oriented.any())
-        self.given = known.copy()
         self.position, self.rotation = np.array(network.images.position), np.array(network.images.rotation)
         self.coordinates = np.array(network.points.coordinates)
         self.methods: list[str] = []
@@ -117,15 +116,21 @@ class _Search:
         return np.asarray(np.bincount(self.point, minlength=len(self.known)) > 0)
 
     def resect_all(self) -> bool:
-        """Resect the images that see the most known points; those that see clearly fewer wait for the next round."""
+        """Resect the images that see the most known points; those that see clearly fewer wait, unless the others fail."""
         usable = self.known[self.point]
         counts = np.bincount(self.image[usable], minlength=len(self.oriented))
         waiting = np.flatnonzero(~self.oriented & (counts >= ENOUGH))
         if not len(waiting):
             return False
-        chosen = waiting[counts[waiting] >= 0.5 * counts[waiting].max()]
+        rich = counts[waiting] >= 0.5 * counts[waiting].max()
+        done = self._resect(waiting[rich], usable) or self._resect(waiting[~rich], usable)
+        if done:
+            self._method("resection")
+        return done
+
+    def _resect(self, images: Ints, usable: Bools) -> bool:
         done = False
-        for i in chosen:
+        for i in images:
             rows = np.flatnonzero(usable & (self.image == i))
             try:
                 pose = resect(self.xy[rows], self.coordinates[self.point[rows]])
@@ -134,10 +139,6 @@ class _Search:
                 continue
             self.position[i], self.rotation[i] = pose.position, pose.rotation
             self.oriented[i] = done = True
-        if done:
-            self._method("resection")
-        elif len(waiting) > len(chosen):
-            self.oriented[chosen] = False
         return done
 
     def intersect_all(self, min_angle: float = 0.02) -> bool:
@@ -166,7 +167,7 @@ class _Search:
         """Orient a pair of images relatively: in the free network, or as a model that is then moved onto the control."""
         if self.fixed_frame:
             return self._model_on_control()
-        pair = self._best_pair(np.ones(len(self.oriented), dtype=bool))
+        pair = self._best_pair()
         if pair is None:
             return False
         first, second, model = pair
@@ -177,30 +178,29 @@ class _Search:
         self._method("relative orientation")
         return True
 
-    def _best_pair(self, allowed: Bools):  # type: ignore[no-untyped-def]
+    def _best_pair(self) -> tuple[int, int, RelativeOrientation] | None:
         """Return the pair with many common points and a large angle between the rays."""
-        sets = {int(i): np.flatnonzero(self.image == i) for i in np.flatnonzero(allowed)}
+        rows = [np.flatnonzero(self.image == i) for i in range(len(self.oriented))]
         shared = []
-        for i, j in combinations(sets, 2):
-            count = len(np.intersect1d(self.point[sets[i]], self.point[sets[j]], assume_unique=False))
+        for i, j in combinations(range(len(rows)), 2):
+            count = len(np.intersect1d(self.point[rows[i]], self.point[rows[j]]))
             if count >= 6:
-                shared.append((count, i, j))
-        best = None
-        for count, i, j in sorted(shared, key=lambda s: (-s[0], s[1], s[2]))[:12]:
-            common, a, b = np.intersect1d(self.point[sets[i]], self.point[sets[j]], return_indices=True)
+                shared.append((-count, i, j))
+        best: tuple[float, int, int, RelativeOrientation] | None = None
+        for _, i, j in sorted(shared)[:12]:
+            _, a, b = np.intersect1d(self.point[rows[i]], self.point[rows[j]], return_indices=True)
             try:
-                model = relative_orientation(self.xy[sets[i][a]], self.xy[sets[j][b]])
+                model = relative_orientation(self.xy[rows[i][a]], self.xy[rows[j][b]])
             except BaardaError as error:
                 self.why = f" ({error})"
                 continue
             points = model.points[np.isfinite(model.points).all(axis=1)]
             if not len(points):
                 continue
-            depth = float(np.median(np.linalg.norm(points, axis=1)))
-            score = len(points) * min(1.0, 1.0 / max(depth, 1e-12) / 0.3)
+            depth = float(np.median(np.linalg.norm(points, axis=1)))  # in bases
+            score = len(points) * min(1.0, 3.0 / depth)
             if best is None or score > best[0]:
                 best = (score, i, j, model)
-            del common, count
         return None if best is None else best[1:]
 
     def _model_on_control(self) -> bool:
