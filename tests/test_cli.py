@@ -121,7 +121,7 @@ def test_not_converged_writes_a_folder_without_tests(camcal, tmp_path, monkeypat
         (["demo", "--tables", "xml", "--out", "o"], 2, "tables"),
         (["demo", "--sigma", "both", "--out", "o"], 2, "sigma"),
         (["nonsense"], 2, "nonsense"),
-        (["demo", "--out", "strange.txt"], 4, "not a result folder"),
+        (["demo", "--out", "strange.txt"], 4, "is not an empty folder"),
         (["demo", "--out", "/proc/nothing/here"], 4, "cannot write"),
     ],
 )

@@ -260,16 +260,17 @@ def _adjust_and_report(
     started: float,
 ) -> None:
     from baarda.adjustment import adjust as adjust_network
+    from baarda.formats.folder import check_target
     from baarda.hypotheses.levels import Options
     from baarda.procedures.testing import analyse
     from baarda.report import page
-    from baarda.report.result_folder import check_target, result_json, write_folder
+    from baarda.report.result_folder import MARK, result_json, write_folder
 
     if tables not in ("csv", "parquet"):
         raise UsageError(f"--tables is csv or parquet, not {tables!r}")
     options = Options(**levels)
     if out is not None:
-        check_target(out)
+        check_target(out, MARK)
 
     def progress(step: Any) -> None:
         relative = "" if step.relative_step is None else f"  relative step {step.relative_step:.1e}"

@@ -5,9 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
-import shutil
-import tempfile
 import textwrap
 from collections.abc import Iterator
 from importlib import resources
@@ -15,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from baarda import __version__
-from baarda.errors import OutputError
+from baarda.formats.folder import write_folder
 from baarda.papers._drawing import document, inline
 from baarda.papers.base import Comparison, Reproduction, Row, Value
 
@@ -198,26 +195,5 @@ def write(reproduction: Reproduction, folder: str | Path) -> Path:
     }
     files |= {f"tables/{c.table}.csv": table_csv(c) for c in reproduction.comparisons}
     files |= {f"figures/{f.name}.svg": document(f.svg, f.title, f.alt) for f in reproduction.figures}
-    if target.exists() and not (target.is_dir() and (not any(target.iterdir()) or (target / "reproduce.json").is_file())):
-        raise OutputError(f"{target} exists and is not the folder of a reproduction: choose another --out")
-    temporary: Path | None = None
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-        for name, text in files.items():
-            (temporary / name).parent.mkdir(exist_ok=True)
-            (temporary / name).write_text(text, encoding="utf-8", newline="\n")
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o777 & ~mask)  # temporary folders are private
-        old = target.with_name(f".{target.name}-old-{os.getpid()}")
-        if target.exists():
-            target.rename(old)
-        temporary.rename(target)
-        shutil.rmtree(old, ignore_errors=True)
-    except OSError as error:
-        raise OutputError(f"cannot write {target}: {error.strerror}") from None
-    finally:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
+    write_folder(target, files, mark="reproduce.json")
     return target

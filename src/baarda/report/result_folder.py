@@ -6,12 +6,7 @@ import csv
 import io
 import json
 import math
-import os
 import platform
-import shutil
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +14,8 @@ import numpy as np
 
 import baarda
 from baarda.adjustment import Adjustment
-from baarda.errors import MissingExtra, OutputError
+from baarda.errors import MissingExtra
+from baarda.formats.folder import whole_folder
 from baarda.formats.project import write as write_project
 from baarda.hypotheses.base import TestResult
 from baarda.network import Table
@@ -27,6 +23,7 @@ from baarda.observations import Direct, ImagePoints
 from baarda.procedures.testing import Analysis
 
 SCHEMA = "baarda.result/1"
+MARK = "result.json"  # the file by which an earlier result folder is known
 
 
 def plain(value: Any) -> Any:
@@ -216,60 +213,6 @@ def _cells(column: np.ndarray[Any, Any]) -> list[str]:
     return [str(v) for v in column.tolist()]
 
 
-def check_target(target: Path) -> None:
-    """Refuse, before any work, a target that cannot be written or that is somebody else's folder.
-
-    Raises
-    ------
-    OutputError
-        See `whole_folder`.
-    """
-    _temporary(target.absolute()).rmdir()
-
-
-def _temporary(target: Path) -> Path:
-    """Make a temporary folder beside the (absolute) target."""
-    try:
-        if target.exists() and not (target.is_dir() and (not any(target.iterdir()) or (target / "result.json").is_file())):
-            raise OutputError(f"{target} exists and is not a result folder: choose another --out")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        return Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-    except OSError as error:
-        raise OutputError(f"cannot write {target}: {error.strerror}") from None
-
-
-@contextmanager
-def whole_folder(target: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `target` and rename it there on success; on any failure nothing is left.
-
-    Raises
-    ------
-    OutputError
-        If the target is a file or a folder that this program did not write, or if writing fails.
-    """
-    target = target.absolute()
-    temporary = _temporary(target)
-    try:
-        yield temporary
-        _permit(temporary)
-        old = target.with_name(f".{target.name}-old-{os.getpid()}")
-        if target.exists():
-            target.rename(old)
-        temporary.rename(target)
-        shutil.rmtree(old, ignore_errors=True)
-    except OSError as error:
-        raise OutputError(f"cannot write {target}: {error.strerror}") from None
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _permit(folder: Path) -> None:
-    """Give the folder the permissions that the user's mask allows (temporary folders are private)."""
-    mask = os.umask(0)
-    os.umask(mask)
-    folder.chmod(0o777 & ~mask)
-
-
 def write_folder(analysis: Analysis, out: str | Path, tables: str = "csv", run: dict[str, Any] | None = None) -> Path:
     """Write the result folder.
 
@@ -306,7 +249,7 @@ def write_folder(analysis: Analysis, out: str | Path, tables: str = "csv", run: 
     document = json.dumps(result_json(analysis), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
     sections = page.sections(analysis)
     html = page.html(analysis, sections)
-    with whole_folder(target) as folder:
+    with whole_folder(target, MARK) as folder:
         _write(folder / "result.json", document)
         _write(folder / "report.html", html)
         (folder / "tables").mkdir()

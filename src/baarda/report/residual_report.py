@@ -1,0 +1,392 @@
+"""A table of residuals read, studied, and told: result folder, JSON, and the verdict in sentences."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import baarda
+from baarda.errors import MissingExtra, UsageError
+from baarda.formats import digest
+from baarda.formats.folder import check_target, whole_folder
+from baarda.formats.residual_table import ResidualTable, read
+from baarda.hypotheses.base import TestResult
+from baarda.network import Table
+from baarda.procedures.law_study import LawStudy, StudyOptions
+from baarda.procedures.residual_study import ResidualStudy, ScaleRule, study
+from baarda.report import page
+from baarda.report.residual_sections import sections
+from baarda.report.residual_verdict import sentences
+from baarda.report.result_folder import MARK, plain, table_csv
+from baarda.report.sections.base import WORDS, Cell, Section
+
+SCHEMA = "baarda.residuals/1"
+
+
+class Outcome(NamedTuple):
+    """What studying a table gives: the study, the verdict in sentences, and the content of `result.json`."""
+
+    study: ResidualStudy
+    verdict: list[str]
+    document: dict[str, Any]
+
+
+def run(
+    path: str | Path,
+    out: str | Path | None = None,
+    column: str | None = None,
+    group: str | None = None,
+    options: StudyOptions | None = None,
+    *,
+    sigma: str | None = None,
+    redundancy: str | None = None,
+    tables: str = "csv",
+    facts: Mapping[str, Any] | None = None,
+) -> Outcome:
+    """Read a table of residuals, study it, and write the result folder.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV, NPY or Parquet.
+    out : str or Path, optional
+        Result folder; nothing is written without it.
+    column, group, sigma, redundancy : str, optional
+        Columns; see `baarda.formats.residual_table.read`.
+    options : StudyOptions, optional
+    tables : {"csv", "parquet"}
+        Format of the tables of the folder.
+    facts : mapping, optional
+        What differs from run to run (timings), for `run.json`.
+
+    Returns
+    -------
+    Outcome
+
+    Raises
+    ------
+    InputError
+        If the table cannot be used; the message names file and line.
+    OutputError
+        If the folder cannot be written; nothing is left behind.
+    UsageError
+        If options make no sense for the table.
+    """
+    if tables not in ("csv", "parquet"):
+        raise UsageError(f"tables are csv or parquet, not {tables!r}")
+    if out is not None:
+        check_target(Path(out), MARK)
+    table = read(path, column, group, sigma, redundancy)
+    found = study(table.values, table.groups, table.sigmas, table.redundancy_numbers, options, group_names=table.group_names)
+    document = result_json(table, found)
+    if out is not None:
+        write_folder(table, found, out, tables, facts)
+    return Outcome(found, verdict(table, found), document)
+
+
+def verdict(table: ResidualTable, found: ResidualStudy) -> list[str]:
+    """Return the outcome in plain sentences.
+
+    Parameters
+    ----------
+    table : ResidualTable
+    found : ResidualStudy
+
+    Returns
+    -------
+    list of str
+    """
+    return [page.printable(s.text) for s in sentences(table, found)]
+
+
+# ---- JSON and tables ----------------------------------------------------------------------------------------------------------------
+
+
+def result_json(table: ResidualTable, found: ResidualStudy) -> dict[str, Any]:
+    """Return the content of `result.json`; its schema is "baarda.residuals/1".
+
+    Parameters
+    ----------
+    table : ResidualTable
+    found : ResidualStudy
+
+    Returns
+    -------
+    dict
+        JSON-compatible; infinite numbers (a = inf is the normal law) are None.
+    """
+    import scipy
+
+    o, groups = found.options, found.groups
+    every = (*found.tests, *(groups.tests if groups is not None else ()), *((found.laws.ratio,) if found.laws.ratio is not None else ()))
+    document = {
+        "schema": SCHEMA,
+        "source": {
+            "path": table.path,
+            "format": table.format,
+            "sha256": digest(Path(table.path)),
+            "columns": {"residual": table.column, "group": table.group, "sigma": table.sigma, "redundancy": table.redundancy},
+        },
+        "assumptions": list(table.assumptions),
+        "options": {
+            "alpha": o.alpha,
+            "loc": o.loc,
+            "classes": o.classes if isinstance(o.classes, str) else list(o.classes),
+            "number": o.number,
+            "ends": o.ends,
+            "merge": o.merge,
+            "levels": o.levels,
+            "interval": o.interval,
+            "replicas": o.replicas,
+            "seed": o.seed,
+        },
+        "counts": {"values": found.n, "set_aside": found.set_aside, "groups": 0 if groups is None else len(groups.names)},
+        "sample": {
+            "kind": found.kind,
+            "mean": found.mean,
+            "standard_deviation": found.deviation,
+            "skewness": found.skewness,
+            "kurtosis": found.kurtosis,
+            "minimum": found.values.min(),
+            "maximum": found.values.max(),
+            "rounded": found.laws.rounded,
+            "redundancy": found.redundancy,
+            "sigma0": found.sigma0,
+        },
+        "tests": [_test(t) for t in every],
+        "scale_rules": [_scale_rule(r) for r in found.scale_rules],
+        "laws": [_law(found, s) for s in found.laws.laws],
+        "modulated_normal": _modulated(found),
+        "chi_square_ratios": {"descriptive": True, "values": found.laws.chi_square_ratios},
+        "left_out": [{"what": what, "why": why} for what, why in found.left_out],
+        "verdict": verdict(table, found),
+        "software": {
+            "name": "baarda",
+            "version": baarda.__version__,
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "scipy": str(scipy.__version__),
+        },
+    }
+    return dict(plain(document))
+
+
+def _test(t: TestResult) -> dict[str, Any]:
+    out: dict[str, Any] = {"name": t.name, "null": t.null, "df": list(t.df), "law": t.law_name, "alpha": t.alpha, "critical": t.critical}
+    if np.ndim(t.statistic):
+        extreme = t.details.get("extreme", {})
+        out |= {"tested": t.details.get("tested"), "beyond": t.details.get("rejected"), "rejected": bool(np.any(t.rejected))}
+        out |= {"statistic": extreme.get("statistic"), "p_value": extreme.get("p_value"), "labels": [extreme.get("label")]}
+    else:
+        out |= {"statistic": t.statistic, "p_value": t.p_value, "rejected": t.rejected}
+    return {**out, "note": t.note} if t.note else out
+
+
+def _scale_rule(r: ScaleRule) -> dict[str, Any]:
+    f = r.fit
+    return {
+        "rule": r.name,
+        "symbol": r.symbol,
+        "mean": r.mean,
+        "standard_deviation": r.deviation,
+        "statistic": None if f is None else f.statistic,
+        "df": None if f is None else f.df,
+        "critical": None if f is None or r.described else f.critical,
+        "p_value": r.p_value,
+        "rejected": r.rejected,
+        "descriptive": r.described,
+    }
+
+
+def _law(found: ResidualStudy, s: LawStudy) -> dict[str, Any]:
+    f = s.fit
+    tests = {t.name: {"statistic": t.statistic, "critical": t.critical, "p_value": t.p_value, "rejected": t.rejected} for t in s.tests}
+    more = {"estimated": list(f.estimated), "standard_errors": dict(f.standard_errors), "at_bounds": list(f.at_bounds)}
+    decision = {"judged_by": found.laws.judged_by(s), "decision": found.laws.rejected(s)}
+    return {**f.as_dict(), **more, "notes": list(f.notes), "distribution_tests": tests, **decision}
+
+
+def _modulated(found: ResidualStudy) -> dict[str, Any] | None:
+    laws = found.laws
+    if laws.modulated is None or laws.interval is None:
+        return None
+    return {
+        "a": laws.modulated.parameters["a"],
+        "interval": {"level": found.options.interval, "lower": laws.interval[0], "upper": laws.interval[1]},
+        "normal_in_interval": bool(np.isinf(laws.interval[1])),
+        "a_of_errors": found.a_of_errors,
+    }
+
+
+def result_tables(found: ResidualStudy) -> dict[str, Table]:
+    """Return the tables of the result folder by name.
+
+    Parameters
+    ----------
+    found : ResidualStudy
+
+    Returns
+    -------
+    dict of Table
+    """
+    rules = found.scale_rules
+    out = {
+        "scale_rules": Table(
+            {
+                "symbol": _texts(r.symbol for r in rules),
+                "mean": _floats(r.mean for r in rules),
+                "standard_deviation": _floats(r.deviation for r in rules),
+                "statistic": _floats(None if r.fit is None else r.fit.statistic for r in rules),
+                "df": _floats(None if r.fit is None else r.fit.df for r in rules),
+                "p_value": _floats(r.p_value for r in rules),
+            }
+        )
+    }
+    laws = found.laws.laws
+    if laws:
+        names = ("kolmogorov", "cramer_von_mises", "anderson_darling")
+        columns = {
+            "law": _texts(s.fit.law for s in laws),
+            "parameters": _texts(", ".join(f"{k} = {v!r}" for k, v in s.fit.parameters.items()) for s in laws),
+            "statistic": _floats(s.fit.statistic for s in laws),
+            "df": _floats(s.fit.df for s in laws),
+            "p_value": _floats(s.fit.p_value for s in laws),
+            **{name: _floats(getattr(s.test(name), "p_value", None) for s in laws) for name in names},
+            "log_likelihood": _floats(s.fit.log_likelihood for s in laws),
+            "aic": _floats(s.fit.aic for s in laws),
+            "bic": _floats(s.fit.bic for s in laws),
+        }
+        out["laws"] = Table(columns)
+    classed = [s.fit for s in laws if s.fit.histogram is not None]
+    first = classed[0].histogram if classed else None
+    if first is not None:
+        expected = {f"expected_{f.law}": f.histogram.expected for f in classed if f.histogram is not None}
+        out["classes"] = Table({"lower": first.edges[:-1], "upper": first.edges[1:], "count": first.counts, **expected})
+    groups = found.groups
+    if groups is not None:
+        each, at = groups.test("variance_per_group"), groups.tested
+        statistic, p = np.full(len(groups.names), np.nan), np.full(len(groups.names), np.nan)
+        if each is not None:
+            statistic[at], p[at] = np.asarray(each.statistic), np.asarray(each.p_value)
+        columns = {"group": _texts(groups.names), "n": groups.counts, "mean": groups.means, "variance": groups.variances, "df": groups.df}
+        out["groups"] = Table({**columns, "statistic": statistic, "p_value": p})
+    return out
+
+
+def _texts(values: Any) -> Any:
+    return np.array(list(values), dtype=object)
+
+
+def _floats(values: Any) -> Any:
+    return np.array([np.nan if v is None else v for v in values], dtype=float)
+
+
+# ---- page and folder ----------------------------------------------------------------------------------------------------------------
+
+
+def html(table: ResidualTable, found: ResidualStudy, made: list[Section]) -> str:
+    """Return the report as one page: no scripts, nothing loaded from anywhere.
+
+    Parameters
+    ----------
+    table : ResidualTable
+    found : ResidualStudy
+    made : list of Section
+
+    Returns
+    -------
+    str
+    """
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
+
+    folder = resources.files("baarda.report") / "texts"
+
+    def load(name: str) -> str:
+        # The page of adjustments is the page of this report too, but for its name.
+        return (folder / name).read_text(encoding="utf-8").replace("Adjustment report", "Residual report")
+
+    environment = Environment(
+        autoescape=True,
+        finalize=lambda value: page.printable(value) if type(value) is str else value,
+        loader=FunctionLoader(load),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.tests["cell"] = lambda value: isinstance(value, Cell)
+    tones = [s.tone for s in sentences(table, found)]
+    bad, warn = tones.count("bad"), tones.count("warn")
+    overall = ("bad", "A test of the model failed") if bad else ("warn", "The law needs attention") if warn else ("good", "No test failed")
+    facts = [("values", str(found.n)), ("column", table.column), ("groups", "-" if found.groups is None else str(len(found.groups.names)))]
+    context: dict[str, Any] = {
+        "name": table.path,
+        "status": "studied",
+        "sections": [(n, s, [(type(b).__name__.lower(), b) for b in s.blocks]) for n, s in enumerate(made, start=1)],
+        "words": WORDS,
+        "inline": page._inline,
+        "glossary": page.glossary,
+        "facts": [*facts, ("mean", f"{found.mean:.3g}"), ("standard deviation", f"{found.deviation:.4g}")],
+        "overall": overall,
+    }
+    return environment.get_template("report.html.j2").render(context)
+
+
+def write_folder(
+    table: ResidualTable, found: ResidualStudy, out: str | Path, tables: str = "csv", facts: Mapping[str, Any] | None = None
+) -> Path:
+    """Write the result folder.
+
+    Parameters
+    ----------
+    table : ResidualTable
+    found : ResidualStudy
+    out : str or Path
+        There whole or not at all; an earlier result folder there is replaced.
+    tables : {"csv", "parquet"}
+    facts : mapping, optional
+        For `run.json`.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    MissingExtra
+        If Parquet is asked for without the extra 'tables'.
+    OutputError
+        If it cannot be written; nothing is left behind.
+    """
+    target = Path(out)
+    made = sections(table, found)
+    document = json.dumps(result_json(table, found), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    texts = {"result.json": document, "report.html": html(table, found, made)}
+    texts |= {f"figures/{name}.svg": svg for name, svg in page.figures(made).items()}
+    texts["run.json"] = json.dumps(plain(dict(facts or {})), indent=1, allow_nan=False) + "\n"
+    content = result_tables(found)
+    if tables == "csv":
+        texts |= {f"tables/{name}.csv": table_csv(t) for name, t in content.items()}
+    with whole_folder(target, MARK) as folder:
+        for name in ("tables", "figures"):
+            (folder / name).mkdir()
+        for name, text in texts.items():
+            # A label may hold half of a surrogate pair, which no encoding takes.
+            (folder / name).write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
+        if tables == "parquet":
+            for name, t in content.items():
+                _parquet(t, folder / "tables" / f"{name}.parquet")
+    return target
+
+
+def _parquet(table: Table, path: Path) -> None:
+    try:
+        from pyarrow import parquet
+    except ImportError:
+        raise MissingExtra("tables", "--tables parquet") from None
+    parquet.write_table(table.to_arrow(), path)
