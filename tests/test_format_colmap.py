@@ -124,7 +124,7 @@ def test_recognised_by_content(tmp_path):
 @pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"])
 @pytest.mark.parametrize("rigs", [1, 2])
 def test_against_pycolmap(model, rigs, tmp_path):
-    pycolmap = pytest.importorskip("pycolmap")
+    pycolmap = pytest.importorskip("pycolmap", reason="the oracle pycolmap is not installed (extra 'oracle')")
     parameters = {
         "SIMPLE_PINHOLE": [1280.0, 512, 384],
         "PINHOLE": [1280.0, 1290, 512, 384],
@@ -177,7 +177,7 @@ def test_against_pycolmap(model, rigs, tmp_path):
 
 
 def test_pycolmap_reads_what_we_write(tmp_path):
-    pycolmap = pytest.importorskip("pycolmap")
+    pycolmap = pytest.importorskip("pycolmap", reason="the oracle pycolmap is not installed (extra 'oracle')")
     n = _writable()
     colmap.write(n, tmp_path / "m")
     model = pycolmap.Reconstruction(str(tmp_path / "m"))

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import statsmodels.api as sm
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
@@ -71,6 +70,7 @@ def test_tau_law_at_its_bound_and_with_one_degree_of_freedom() -> None:
 def test_statsmodels_influence() -> None:
     a, l_, _ = random_model(1)
     e = linear_model(a, l_)
+    sm = pytest.importorskip("statsmodels.api", reason="the oracle statsmodels is not installed (extra 'oracle')")
     influence = sm.OLS(l_, a).fit().get_influence()
     tau = outliers.tau(e.residuals, e.qvv, e.variance_factor)
     np.testing.assert_allclose(-tau, influence.resid_studentized_internal, rtol=1e-9)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import statsmodels.api as sm
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
@@ -81,6 +80,7 @@ def test_the_form_is_the_growth_of_vpv_under_the_constraint(seed: int) -> None:
 
 def test_statsmodels_f_and_t() -> None:
     a, l_, e = model(3)
+    sm = pytest.importorskip("statsmodels.api", reason="the oracle statsmodels is not installed (extra 'oracle')")
     fit = sm.OLS(l_, a).fit()
     b, w = np.array([[0.0, 0, 1, -1, 0, 0], [0, 0, 0, 2, 0, 1.0]]), np.array([0.3, -0.2])
     theirs = fit.f_test((b, w))

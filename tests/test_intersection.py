@@ -124,7 +124,7 @@ def test_no_rays_at_all() -> None:
 
 
 def test_same_as_colmap_midpoint() -> None:
-    pycolmap = pytest.importorskip("pycolmap", reason="oracle: pip install pycolmap")
+    pycolmap = pytest.importorskip("pycolmap", reason="the oracle pycolmap is not installed (extra 'oracle')")
     turned = np.diag([1.0, -1.0, -1.0])  # its camera looks along +z, y down
     rng = np.random.default_rng(5)
     for _ in range(5):

@@ -197,7 +197,7 @@ def test_aerial_pair() -> None:
 
 
 def test_same_as_colmap() -> None:
-    pycolmap = pytest.importorskip("pycolmap", reason="oracle: pip install pycolmap")
+    pycolmap = pytest.importorskip("pycolmap", reason="the oracle pycolmap is not installed (extra 'oracle')")
     rng = np.random.default_rng(6)
     lens = pycolmap.Camera(model="SIMPLE_PINHOLE", width=2000, height=2000, params=[1000.0, 1000.0, 1000.0])
     turned = np.diag([1.0, -1.0, -1.0])  # its camera looks along +z, y down

@@ -298,7 +298,7 @@ def test_aerial_images() -> None:
 
 
 def test_same_orientation_as_colmap() -> None:
-    pycolmap = pytest.importorskip("pycolmap", reason="oracle: pip install pycolmap")
+    pycolmap = pytest.importorskip("pycolmap", reason="the oracle pycolmap is not installed (extra 'oracle')")
     rng = np.random.default_rng(21)
     least_squares_only = pycolmap.AbsolutePoseRefinementOptions()
     least_squares_only.loss_function_scale, least_squares_only.gradient_tolerance = 1e4, 1e-9

@@ -71,7 +71,7 @@ def test_large_coordinates() -> None:
 
 
 def test_same_as_colmap() -> None:
-    pycolmap = pytest.importorskip("pycolmap", reason="oracle: pip install pycolmap")
+    pycolmap = pytest.importorskip("pycolmap", reason="the oracle pycolmap is not installed (extra 'oracle')")
     rng = np.random.default_rng(3)
     source, target = rng.normal(size=(12, 3)), rng.normal(size=(12, 3)) + 3
     ours, theirs = similarity(source, target), pycolmap.estimate_sim3d(source, target).matrix()
