@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import csv
 import math
+import tokenize
+import warnings
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -24,7 +26,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
 RESIDUAL, SIGMA, REDUNDANCY = "residual", "sigma", "redundancy"
-GROUPS = ("group", "image")
+GROUPS = ("image", "group")  # the table of observations that `adjust` writes has both, and its group is the kind of observation
 LEAST = 3
 _LONGEST_LINE = 1 << 20
 _MOST_GROUPS = 1_000_000
@@ -115,7 +117,7 @@ def read(
     column : str, optional
         The residuals; default ``residual``, or the only numeric column.
     group : str, optional
-        The groups; default ``group`` or ``image`` where present.
+        The groups; default ``image``, else ``group``, where present.
     sigma, redundancy : str, optional
         Sigmas and redundancy numbers; default the columns of these names where present.
 
@@ -378,10 +380,29 @@ def _no_number(name: str, text: str, file: Path, line: int, separator: str) -> I
 # ---- NPY ----------------------------------------------------------------------------------------------------------------------------
 
 
+# What NumPy raises on headers that were written by nobody or by chance.
+_HEADER_ERRORS = (
+    ValueError,
+    OSError,
+    EOFError,
+    TypeError,
+    KeyError,
+    AttributeError,
+    IndexError,
+    OverflowError,
+    SyntaxError,
+    RecursionError,
+    MemoryError,
+    tokenize.TokenError,
+)
+
+
 def _read_npy(file: Path, wanted: _Wanted, assumptions: list[str]) -> tuple[_Choice, _Raw]:
     try:
-        data = np.load(file, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError, TypeError, KeyError, OverflowError, SyntaxError, RecursionError, MemoryError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of headers that Python 2 wrote
+            data = np.load(file, mmap_mode="r", allow_pickle=False)
+    except _HEADER_ERRORS as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         if "pickle" in reason or "object" in reason.lower():
             reason = "an array of Python objects is refused: save numbers"

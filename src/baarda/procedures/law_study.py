@@ -18,7 +18,7 @@ from baarda.distributions.replicas import columnwise, refit_columns
 from baarda.errors import UsageError
 from baarda.hypotheses.base import SimulatedLaw, TestResult
 from baarda.hypotheses.goodness_of_fit import empirical_statistics, normal_against_modulated
-from baarda.hypotheses.levels import Policy, check_level, single_level
+from baarda.hypotheses.levels import Policy, applied_level, check_level
 
 LAWS = ("normal", "radico", "lineo", "modulated_normal", "student", "laplace", "generalised_normal", "logistic", "contaminated_normal")
 STATISTICS = ("kolmogorov", "cramer_von_mises", "anderson_darling")
@@ -42,7 +42,7 @@ class StudyOptions:
     alpha : float
         Level of each test.
     laws : tuple of str
-        Laws to compare.
+        Laws to compare; with ``modulated_normal`` among them the normal is also tested against it.
     loc : float, optional
         Expectation of the residuals where it is known (0 for residuals without a systematic part); estimated when None.
     classes : {"equal_probability", "equal_width"} or tuple of float
@@ -87,7 +87,7 @@ class StudyOptions:
     def __post_init__(self) -> None:
         check_level(self.alpha)
         check_level(self.interval, "interval")
-        single_level(self.alpha, 1, "none" if self.levels in ("holm", "fdr", "baarda") else self.levels)
+        applied_level([0.5], self.alpha, self.levels)  # refuses an unknown policy
         if not self.laws:
             raise UsageError("no laws given to compare")
         for name in self.laws:
@@ -319,6 +319,8 @@ def study_laws(values: ArrayLike, options: StudyOptions | None = None, residuals
             continue
         studied.append(LawStudy(found, tests))
     made = LawsStudied(tuple(studied), rounded, left_out=tuple(left_out))
+    if "modulated_normal" not in o.laws:
+        return made
     if len(x) < _LEAST_WITH_SHAPE:
         return replace(made, left_out=(*made.left_out, ("normal against modulated", f"it needs at least {_LEAST_WITH_SHAPE} values")))
     return _modulated(np.asarray(values, dtype=float), made, o, replicas, residuals_of)

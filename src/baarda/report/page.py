@@ -171,7 +171,7 @@ def glossary(table: DataTable) -> list[tuple[str, str]]:
 
 
 def html(analysis: Analysis, made: list[Section]) -> str:
-    """Return sections as one page: no scripts, nothing loaded from anywhere, readable offline.
+    """Return the sections of an adjustment as one page, see `render`.
 
     Parameters
     ----------
@@ -184,32 +184,52 @@ def html(analysis: Analysis, made: list[Section]) -> str:
     -------
     str
     """
+    net = analysis.adjustment.network
+    name = net.name or net.path or "network in memory"
+    return render("Adjustment report", name, analysis.adjustment.status, _overall(analysis, made), _facts(analysis), made)
+
+
+def render(kind: str, name: str, status: str, overall: tuple[str, str], facts: list[tuple[str, str]], made: list[Section]) -> str:
+    """Return sections as one page: no scripts, nothing loaded from anywhere, readable offline.
+
+    Parameters
+    ----------
+    kind, name : str
+        What is reported, and on what.
+    status : str
+        Outcome in one word.
+    overall : (str, str)
+        Tone and words of the whole.
+    facts : list of (str, str)
+        Names and values for the head of the page.
+    made : list of Section
+
+    Returns
+    -------
+    str
+    """
     from jinja2 import Environment, FunctionLoader, StrictUndefined
 
     folder = resources.files("baarda.report") / "texts"
-
-    def load(name: str) -> str:
-        return (folder / name).read_text(encoding="utf-8")
-
     environment = Environment(
         autoescape=True,
         finalize=lambda value: printable(value) if type(value) is str else value,
-        loader=FunctionLoader(load),
+        loader=FunctionLoader(lambda template: (folder / template).read_text(encoding="utf-8")),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     environment.tests["cell"] = lambda value: isinstance(value, Cell)
-    net = analysis.adjustment.network
     context: dict[str, Any] = {
-        "name": net.name or net.path or "network in memory",
-        "status": analysis.adjustment.status,
+        "kind": kind,
+        "name": name,
+        "status": status,
         "sections": [(n, s, [(type(b).__name__.lower(), b) for b in s.blocks]) for n, s in enumerate(made, start=1)],
         "words": WORDS,
         "inline": _inline,
         "glossary": glossary,
-        "facts": _facts(analysis),
-        "overall": _overall(analysis, made),
+        "facts": facts,
+        "overall": overall,
     }
     return environment.get_template("report.html.j2").render(context)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Mapping
-from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +23,7 @@ from baarda.report import page
 from baarda.report.residual_sections import sections
 from baarda.report.residual_verdict import sentences
 from baarda.report.result_folder import MARK, plain, table_csv
-from baarda.report.sections.base import WORDS, Cell, Section
+from baarda.report.sections.base import Section
 
 SCHEMA = "baarda.residuals/1"
 
@@ -303,38 +302,12 @@ def html(table: ResidualTable, found: ResidualStudy, made: list[Section]) -> str
     -------
     str
     """
-    from jinja2 import Environment, FunctionLoader, StrictUndefined
-
-    folder = resources.files("baarda.report") / "texts"
-
-    def load(name: str) -> str:
-        # The page of adjustments is the page of this report too, but for its name.
-        return (folder / name).read_text(encoding="utf-8").replace("Adjustment report", "Residual report")
-
-    environment = Environment(
-        autoescape=True,
-        finalize=lambda value: page.printable(value) if type(value) is str else value,
-        loader=FunctionLoader(load),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.tests["cell"] = lambda value: isinstance(value, Cell)
     tones = [s.tone for s in sentences(table, found)]
     bad, warn = tones.count("bad"), tones.count("warn")
     overall = ("bad", "A test of the model failed") if bad else ("warn", "The law needs attention") if warn else ("good", "No test failed")
     facts = [("values", str(found.n)), ("column", table.column), ("groups", "-" if found.groups is None else str(len(found.groups.names)))]
-    context: dict[str, Any] = {
-        "name": table.path,
-        "status": "studied",
-        "sections": [(n, s, [(type(b).__name__.lower(), b) for b in s.blocks]) for n, s in enumerate(made, start=1)],
-        "words": WORDS,
-        "inline": page._inline,
-        "glossary": page.glossary,
-        "facts": [*facts, ("mean", f"{found.mean:.3g}"), ("standard deviation", f"{found.deviation:.4g}")],
-        "overall": overall,
-    }
-    return environment.get_template("report.html.j2").render(context)
+    facts += [("mean", f"{found.mean:.3g}"), ("standard deviation", f"{found.deviation:.4g}")]
+    return page.render("Residual report", table.path, "studied", overall, facts, made)
 
 
 def write_folder(

@@ -21,7 +21,6 @@ from baarda.report.sections.verdict import law_name
 MOST_ROWS = 200
 _DRAWN = ("normal", "radico", "lineo", "modulated_normal")
 _LETTERS = {"anderson_darling": "A²", "chi_square": "chi-square"}
-_
 
 
 def sections(table: ResidualTable, study: ResidualStudy) -> list[Section]:

@@ -58,13 +58,13 @@ def _variance_factor(study: ResidualStudy) -> Sentence | None:
     if test is None or study.redundancy is None or not isinstance(test.critical, tuple):
         return None
     low, high = (c / study.redundancy for c in test.critical)
+    ratio = float(test.statistic) / study.redundancy
+    fields = {"value": fixed(ratio, 3), "low": fixed(low, 3), "high": fixed(high, 3), "times": significant(np.sqrt(ratio), 3)}
     text = say(
-        "The variance factor {value} lies {where} {low}..{high}: the residuals are {verb}as large as the sigmas of the table promise.",
-        value=fixed(float(test.statistic) / study.redundancy, 3),
-        where="outside of" if test.rejected else "within",
-        low=fixed(low, 3),
-        high=fixed(high, 3),
-        verb="not " if test.rejected else "",
+        "The variance factor {value} lies outside of {low}..{high}: the residuals are {times} times as large as the sigmas promise."
+        if test.rejected
+        else "The variance factor {value} lies within {low}..{high}: the residuals are as large as the sigmas promise.",
+        **fields,
     )
     return Sentence("Variance factor", text, "bad" if test.rejected else "good", "tests")
 
@@ -90,7 +90,7 @@ def _moments_sentence(study: ResidualStudy) -> Sentence | None:
             parts.append("the residuals are skew")
         if "kurtosis" in wrong:
             parts.append(f"the tails are {'longer' if study.kurtosis > 3.0 else 'shorter'} than those of the normal law")
-        text, tone = say("Of the moments {parts} ({ps}).", parts="; ".join(parts), ps=ps), "bad" if "mean" in wrong else "warn"
+        text, tone = say("By the moments {parts} ({ps}).", parts="; ".join(parts), ps=ps), "bad" if "mean" in wrong else "warn"
     return Sentence("Moments", text, "good" if tone == "good" else "bad" if tone == "bad" else "warn", "tests")
 
 
@@ -179,7 +179,9 @@ def _modulated(study: ResidualStudy) -> Sentence | None:
             p=_p(laws.ratio.p_value),
         )
     if study.a_of_errors is not None and np.isfinite(study.a_of_errors) and tone == "warn":
-        text += say(" The errors behind the residuals are less normal: a about {a}.", a=significant(study.a_of_errors, 2))
+        text += say(
+            " By the kurtosis relation the errors behind the residuals are less normal: a about {a}.", a=significant(study.a_of_errors, 2)
+        )
     return Sentence("Modulated normal", text, tone, "laws")
 
 
