@@ -219,3 +219,33 @@ def test_convert_to_the_project_and_back(data, tmp_path):
     points = {row["point"]: row for row in result["check_points"]}
     assert points["351"]["dz"] == pytest.approx(-0.459, abs=5e-4)
     assert points["410"]["p_value"] is not None
+
+
+def test_residuals_of_a_table(tmp_path):
+    import numpy as np
+
+    rng = np.random.default_rng(3)
+    values = rng.standard_normal(300)
+    rows = "\n".join(f"{'ab'[i % 2]},{v!r}" for i, v in enumerate(values.tolist()))
+    (tmp_path / "t.csv").write_text("group,residual\n" + rows + "\n")
+    done = run("residuals", "t.csv", "--out", "r", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "300 values" in done.stdout
+    result = json.loads((tmp_path / "r" / "result.json").read_text())
+    assert result["schema"] == "baarda.residuals/1"
+    again = run("residuals", "t.csv", "--json", "--quiet", cwd=tmp_path)
+    assert json.loads(again.stdout) == result
+    (tmp_path / "t.csv").write_text("residual\n1\nnan\n")
+    broken = run("residuals", "t.csv", "--out", "s", cwd=tmp_path)
+    assert broken.returncode == 2
+    assert "t.csv, line 3" in broken.stderr
+    assert not (tmp_path / "s").exists()
+
+
+def test_reproduce(tmp_path):
+    done = run("reproduce", "maarek-konecny", "--out", "r", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "17 of 17 decisions" in done.stdout
+    assert {p.name for p in (tmp_path / "r").iterdir()} == {"reproduce.html", "reproduce.json", "tables", "figures"}
+    wrong = run("reproduce", "nobody", cwd=tmp_path)
+    assert (wrong.returncode, "no paper named 'nobody'" in wrong.stderr) == (2, True)
