@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from baarda.errors import RedundancyNotPositive, UsageError
-from baarda.hypotheses.base import Floats, Law
+from baarda.hypotheses.base import Floats, Law, simulated_rank
 
 
 def check_redundancy(redundancy: float) -> None:
@@ -111,9 +111,9 @@ class SimulatedFamily:
 
     def ppf(self, q: Any) -> Any:
         """Return the quantile of each member."""
-        n = len(self.values)
-        rank = int(min(max(np.ceil(float(q) * (n + 1)) - 1, 0), n - 1))
-        return self.values[rank]
+        n, k = self.values.shape
+        rank = int(simulated_rank(q, n))
+        return self.values[rank] if 0 <= rank < n else np.full(k, np.inf if rank >= n else -np.inf)
 
     def _rank(self, x: Any, side: Any) -> Floats:
         n, k = self.values.shape

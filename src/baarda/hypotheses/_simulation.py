@@ -39,7 +39,8 @@ def affordable(evidence: Evidence, options: Options) -> int:
     """Return the number of replicas that can be afforded; 0 where the null cannot be simulated."""
     if evidence.residuals_of is None:
         return 0
-    count = int(min(options.replicas, _NUMBERS // max(len(evidence.residuals), 1)))
+    wanted = max(options.replicas, int(np.ceil(4.0 / options.alpha)) - 1)  # a two-sided test at level alpha needs 2 / alpha - 1
+    count = int(min(wanted, _NUMBERS // max(len(evidence.residuals), 1)))
     return count if count >= min(_FEWEST, options.replicas) else 0
 
 
@@ -71,7 +72,9 @@ def null_note(evidence: Evidence, options: Options, count: int) -> str:
     """Return how the null law was found."""
     if count:
         fewer = f" (fewer than {options.replicas}: {len(evidence.residuals)} observations)" if count < options.replicas else ""
-        return f"Null law by {count} simulated adjustments of normal errors{fewer}, seed {options.seed}."
+        coarse = 2.0 / (count + 1) > options.alpha
+        undecided = f" They are too few for the level {options.alpha:g}: a test that does not reject decides nothing." if coarse else ""
+        return f"Null law by {count} simulated adjustments of normal errors{fewer}, seed {options.seed}.{undecided}"
     why = "too many observations to simulate" if evidence.residuals_of is not None else "the map from errors to residuals is not at hand"
     return f"Asymptotic law for independent residuals of equal variance ({why}): approximate for residuals of an adjustment."
 

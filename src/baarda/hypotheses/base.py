@@ -53,10 +53,19 @@ class SimulatedLaw:
         return (1.0 + np.searchsorted(self.values, x, side="right")) / (n + 1.0)
 
     def ppf(self, q: Any) -> Any:
-        """Return the quantile: the value that ``sf`` or ``cdf`` places at level q."""
-        n = len(self.values)
-        rank = np.clip(np.ceil(np.asarray(q) * (n + 1)).astype(int) - 1, 0, n - 1)
-        return self.values[rank]
+        """Return the limit beyond which ``sf`` (q > 1/2) or ``cdf`` does not exceed the level; infinite where the replicas are too few."""
+        rank = simulated_rank(q, len(self.values))
+        return np.concatenate([[-np.inf], self.values, [np.inf]])[rank + 1]
+
+
+def simulated_rank(q: Any, n: int) -> Any:
+    """Return the rank (from 0) of the limit at quantile q among n sorted simulated values; -1 or n where n is too small for the level.
+
+    A value t is beyond the upper limit exactly where (1 + number of values >= t) / (n + 1) <= 1 - q, and likewise below.
+    """
+    q = np.asarray(q, dtype=float)
+    count = np.floor(np.minimum(q, 1.0 - q) * (n + 1) * (1.0 + 1e-12)).astype(int)  # values that may lie beyond, plus one
+    return np.where(q > 0.5, n - count, count - 1)
 
 
 @dataclass(frozen=True)
@@ -126,7 +135,7 @@ class TestResult:
     @property
     def rejected(self) -> Any:
         """Whether the null hypothesis is rejected at level `alpha`; same shape as `statistic`."""
-        r = np.asarray(self.p_value) < self.alpha
+        r = np.asarray(self.p_value) <= self.alpha * (1.0 + 1e-12)  # a p-value equal to the level rejects: exact for simulated laws
         return r if r.ndim else bool(r)
 
 

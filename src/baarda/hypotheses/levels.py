@@ -137,7 +137,7 @@ def single_level(alpha: float, count: int, policy: Policy = "sidak") -> float:
 
 
 def applied_level(p_values: ArrayLike, alpha: float, policy: Policy = "none") -> float:
-    """Return the level to which each p-value of a family is to be compared so that `p < level` is the policy's decision.
+    """Return the level to which each p-value of a family is to be compared so that `p <= level` is the policy's decision.
 
     Parameters
     ----------
@@ -180,8 +180,7 @@ def applied_level(p_values: ArrayLike, alpha: float, policy: Policy = "none") ->
         return alpha / max(m - rejected, 1)
     passed = np.flatnonzero(p <= alpha * np.arange(1, m + 1) / m)
     rejected = int(passed[-1]) + 1 if len(passed) else 0
-    # nextafter: a p-value equal to the limit is rejected by Benjamini and Hochberg.
-    return float(np.nextafter(alpha * max(rejected, 1) / m, 1.0))
+    return float(alpha * max(rejected, 1) / m)
 
 
 def noncentrality(alpha: float, power: float, df: float = 1.0) -> float:
@@ -357,7 +356,7 @@ def family_result(
         "policy": policy,
         "family_alpha": alpha,
         "tested": int(np.isfinite(p).sum()),
-        "rejected": int((p < level).sum()),
+        "rejected": int((p <= level * (1.0 + 1e-12)).sum()),
     }
     if counts["tested"]:
         extreme = int(np.nanargmin(p))
