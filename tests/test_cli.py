@@ -143,9 +143,13 @@ def test_singular_network_leaves_no_folder(data, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_of_someone_else_is_not_replaced(tmp_path):
+@pytest.mark.parametrize("content", ["", '{"my": "thing"}', '{"schema": "baarda.result/1"}'])
+def test_a_folder_of_someone_else_is_not_replaced(tmp_path, content):
+    """Not even one with a file of our name in it, and not a result folder that holds a stranger's file."""
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years of work")
+    if content:
+        (tmp_path / "mine" / "result.json").write_text(content)
     done = run("demo", "--out", "mine", "--quiet", cwd=tmp_path)
     assert done.returncode == 4
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "years of work"
@@ -165,6 +169,48 @@ def test_interruption_leaves_nothing(tmp_path):
     assert process.returncode == 130
     assert "interrupted" in rest
     assert list(tmp_path.iterdir()) == []
+
+
+def test_interruption_between_the_renames_brings_the_earlier_folder_back(tmp_path, monkeypatch):
+    from baarda.formats.folder import whole_folder
+    from baarda.report.result_folder import MARK
+
+    old = tmp_path / "r"
+    old.mkdir()
+    (old / "result.json").write_text('{"schema": "baarda.result/1"}')
+    usual = Path.rename
+
+    def interrupted(self, target):
+        done = usual(self, target)
+        if self == old:
+            raise KeyboardInterrupt
+        return done
+
+    monkeypatch.setattr(Path, "rename", interrupted)
+    with pytest.raises(KeyboardInterrupt), whole_folder(old, MARK) as folder:
+        (folder / "result.json").write_text("new")
+    assert [p.name for p in tmp_path.iterdir()] == ["r"]
+    assert "baarda.result" in (old / "result.json").read_text()
+
+
+def test_a_link_is_followed(tmp_path):
+    from baarda.formats.folder import write_folder
+
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    write_folder(tmp_path / "link", {"a.txt": "x"})
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real" / "a.txt").read_text() == "x"
+
+
+@pytest.mark.skipif(os.name == "nt" or not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_standard_output(camcal):
+    with Path("/dev/full").open("w") as full:
+        environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent / "src")}
+        command = [sys.executable, "-m", "baarda", "adjust", str(camcal), "--json", "--quiet"]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, env=environment, check=False)
+    assert done.returncode == 4
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.skipif(os.name == "nt" or not shutil.which("bash"), reason="POSIX limits")

@@ -68,6 +68,10 @@ def guarded(function: Callable[..., None]) -> Callable[..., None]:
         except BrokenPipeError:
             sys.stderr.close()
             raise typer.Exit(4) from None
+        except OSError as error:
+            place = f" {error.filename}" if error.filename else ""
+            typer.echo(f"baarda: cannot read or write{place}: {error.strerror or error}", err=True)
+            raise typer.Exit(4) from None
 
     return run
 
@@ -325,6 +329,7 @@ def _adjust_and_report(
         write_folder(analysis, out, tables, {"seconds": round(time.perf_counter() - started, 3)})
     if as_json:
         typer.echo(json.dumps(result_json(analysis), indent=1, allow_nan=False, ensure_ascii=False))
+        sys.stdout.flush()
     elif not quiet:
         for sentence in page.verdict(analysis):
             typer.echo(sentence)

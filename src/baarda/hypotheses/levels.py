@@ -73,6 +73,8 @@ class Options:
         if self.sigma not in ("aposteriori", "apriori"):
             raise UsageError(f"sigma is 'aposteriori' or 'apriori', not {self.sigma!r}")
         _check_policy(self.levels)
+        if self.seed < 0:
+            raise UsageError(f"the seed must not be negative, not {self.seed}")
         if self.replicas < 1:
             raise UsageError(f"the number of replicas must be positive, not {self.replicas}")
         if not 0.0 <= self.correlation_limit < 1.0:

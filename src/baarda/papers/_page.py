@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from baarda import __version__
-from baarda.formats.folder import write_folder
+from baarda.formats.folder import Mark, write_folder
 from baarda.papers._drawing import document, inline
 from baarda.papers.base import Comparison, Reproduction, Row, Value
 
 SCHEMA = "baarda.reproduction/1"
+MARK = Mark("reproduce.json", "baarda.reproduction/", ("reproduce.html", "reproduce.json", "tables", "figures"))
 _WIDTH = 100
 
 
@@ -195,5 +196,5 @@ def write(reproduction: Reproduction, folder: str | Path) -> Path:
     }
     files |= {f"tables/{c.table}.csv": table_csv(c) for c in reproduction.comparisons}
     files |= {f"figures/{f.name}.svg": document(f.svg, f.title, f.alt) for f in reproduction.figures}
-    write_folder(target, files, mark="reproduce.json")
+    write_folder(target, files, mark=MARK)
     return target

@@ -13,7 +13,7 @@ import numpy as np
 import baarda
 from baarda.errors import MissingExtra, UsageError
 from baarda.formats import digest
-from baarda.formats.folder import check_target, whole_folder
+from baarda.formats.folder import Mark, check_target, whole_folder
 from baarda.formats.residual_table import ResidualTable, read
 from baarda.hypotheses.base import TestResult
 from baarda.network import Table
@@ -22,10 +22,11 @@ from baarda.procedures.residual_study import ResidualStudy, ScaleRule, study
 from baarda.report import page
 from baarda.report.residual_sections import sections
 from baarda.report.residual_verdict import sentences
-from baarda.report.result_folder import MARK, plain, table_csv
+from baarda.report.result_folder import plain, table_csv
 from baarda.report.sections.base import Section
 
 SCHEMA = "baarda.residuals/1"
+MARK = Mark("result.json", "baarda.residuals/", ("report.html", "result.json", "run.json", "tables", "figures"))
 
 
 class Outcome(NamedTuple):

@@ -15,7 +15,7 @@ import numpy as np
 import baarda
 from baarda.adjustment import Adjustment
 from baarda.errors import MissingExtra
-from baarda.formats.folder import whole_folder
+from baarda.formats.folder import Mark, whole_folder
 from baarda.formats.project import write as write_project
 from baarda.hypotheses.base import TestResult
 from baarda.network import Table
@@ -23,7 +23,7 @@ from baarda.observations import Direct, ImagePoints
 from baarda.procedures.testing import Analysis
 
 SCHEMA = "baarda.result/1"
-MARK = "result.json"  # the file by which an earlier result folder is known
+MARK = Mark("result.json", "baarda.result/", ("report.html", "result.json", "run.json", "tables", "figures", "project"))
 
 
 def plain(value: Any) -> Any:
