@@ -380,3 +380,25 @@ def test_free_and_fixed_brown_names():
     assert set(FREE_BROWN) <= set(cameras.model("brown").order)
     assert set(BROWN) <= set(cameras.model("brown").order)
     assert ImagePoints.components == ("x", "y")
+
+
+@pytest.mark.parametrize("blunder", [20.0, 100.0, 200.0, 400.0])
+def test_a_gross_error_does_not_stop_the_iteration(blunder):
+    n = ring(control=5, noise=0.3)
+    group = n.observations[0]
+    xy = np.array(group.xy)
+    xy[40, 1] += blunder
+    r = baarda.adjust(replace(n, observations=(replace(group, xy=xy),)))
+    assert r.status == "converged"
+    gradient = r.lin.design.T @ r.lin.misclosure / r.lin.scale
+    assert np.abs(gradient).max() <= 1e-5 * np.linalg.norm(r.lin.misclosure)
+    assert "point P16 y" in r.contradictions()
+
+
+def test_distances_to_points_set_aside_are_told():
+    n = with_distances(ring(control=5), [(8, 9)])
+    n = replace(
+        n, observations=tuple(g.selected((g.points != 9) | (g.images == 0)) if isinstance(g, ImagePoints) else g for g in n.observations)
+    )
+    r = baarda.adjust(n)
+    assert any("1 of 1 distances end at points set aside" in text for text in r.assumptions)

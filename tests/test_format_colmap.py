@@ -374,3 +374,47 @@ def test_labels_that_are_no_ids_are_numbered(tmp_path):
     again = colmap.read(tmp_path / "m")
     assert again.points.labels == ("1", "2") and again.cameras[0].label == "1"
     assert again.observations[0].points.tolist() == [1, 0]
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "words"),
+    [
+        (
+            "cameras.txt",
+            "900 500 400 -0.1",
+            "900 500 400 1e13",
+            r"cameras.txt, line 3: camera 7: k1 = 10000000000000.0 is not finite or beyond 1e\+12",
+        ),
+        ("cameras.txt", "900 500 400 -0.1", "0 500 400 -0.1", r"cameras.txt, line 3: camera 7: the principal distance must be positive"),
+        ("cameras.txt", "900 500 400 -0.1", "inf 500 400 -0.1", r"cameras.txt, line 3: parameters: not finite"),
+        ("cameras.txt", "900 500 400 -0.1", "\u0669 500 400 -0.1", r"cameras.txt, line 3: parameters: not a number"),
+        ("cameras.txt", "7 SIMPLE", "\u0667 SIMPLE", r"cameras.txt, line 3: camera id is not a whole number"),
+        ("images.txt", "200.25 9 ", "200.25 \u0669 ", r"images.txt, line 4: not the id of a point"),
+        ("points3D.txt", "11 1 2 3", "11 1 2 \u0663", r"points3D.txt, line 3: coordinates: not a number"),
+        ("images.txt", "b c.jpg", "b\x1bc.jpg", r"images.txt, line 3: image name 'folder/b.x1bc.jpg' holds a control character"),
+    ],
+)
+def test_values_that_no_camera_and_no_label_has(file, old, new, words, tmp_path):
+    assert SMALL[file].count(old) == 1
+    where = written(tmp_path / "m", **{file.replace(".", "__"): SMALL[file].replace(old, new)})
+    with pytest.raises(InputError, match=words):
+        colmap.read(where)
+
+
+@pytest.mark.parametrize(("value", "words"), [(1e13, "beyond"), (-1.0, "must be positive"), (float("nan"), "not finite")])
+def test_binary_parameters_that_no_camera_has(value, words, tmp_path):
+    where = binary(tmp_path / "m")
+    raw = (where / "cameras.bin").read_bytes()
+    (where / "cameras.bin").write_bytes(raw.replace(struct.pack("<d", 900.0), struct.pack("<d", value)))
+    with pytest.raises(InputError, match=rf"byte 8: .*camera 7.*{words}|byte 8: .*{words}.*camera 7"):
+        colmap.read(where)
+
+
+@pytest.mark.parametrize("make", [written, binary])
+def test_only_regular_files_of_a_model_are_opened(make, tmp_path):
+    where = make(tmp_path / "m")
+    for file in sorted(where.glob("rigs.*")) + sorted(where.glob("points3D.*")):
+        file.unlink()
+        file.mkdir()
+        with pytest.raises(InputError):
+            colmap.read(where)

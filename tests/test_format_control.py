@@ -94,6 +94,8 @@ BROKEN = {
     "coordinate missing": (HEAD + "P1,,1,,1,1,1,1\n", 2, "Y is observed, but its given value is missing"),
     "no coordinates": (HEAD + "P1,,,,,,,\n", 2, "without given coordinates"),
     "tie": (HEAD + "P2,,1,1,1,1,1,1\nP1,tie,1,1,1,,,\n", 3, "must be control or check"),
+    "huge sigma": (HEAD + "P1,,1,1,1,1,1e200,1\n", 2, "the sigma of a coordinate = 1e+200"),
+    "control character": (HEAD + "P\x011,,1,1,1,1,1,1\n", 2, "control character"),
     "role": (HEAD + "P1,GCP,1,1,1,1,1,1\n", 2, "role must be one of"),
     "not in the network": (HEAD + "Q1,,1,1,1,1,1,1\n", 2, "no point of the table is in the network, whose points are called P0, P1"),
     "free": ("point,X,Y,Z,state_X,state_Y,state_Z\nP1,1,1,1,free,free,free\n", 2, "no coordinate is fixed or observed"),
@@ -127,6 +129,25 @@ def test_a_model_that_cannot_be_carried_over(change, labels, message, tmp_path):
     n = change(replace(ring(), unit="model units"))
     with pytest.raises(InputError, match=message):
         with_control(n, table(tmp_path, HEAD + rows(n, labels)))
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1000.0, "mm"), (0.001, "km")])
+def test_control_in_the_wrong_unit_when_only_cameras_start(factor, unit, tmp_path):
+    n = ring()
+    text = HEAD + rows(n, ["P1", "P2", "P3", "P4"], factor=factor) + rows(n, ["P5", "P6"], role="check", sigma="", factor=factor)
+    # the control's centre is not the origin: in the wrong unit it moves away from the cameras as far as it spreads
+    n = replace(n, points=replace(n.points, coordinates=np.full_like(n.points.coordinates, np.nan)))
+    with pytest.raises(InputError, match=rf"gcp.csv, line 2: .*are the control coordinates in {unit} and not in m\?") as caught:
+        with_control(n, table(tmp_path, text))
+    assert caught.value.exit_code == 2
+
+
+def test_control_in_one_corner_of_a_large_block_is_taken(tmp_path):
+    n = ring()
+    text = HEAD + rows(n, ["P1", "P2", "P3"])
+    away = n.images.position + np.linspace(0.0, 5000.0, len(n.images.labels))[:, None] * [1.0, 0.0, 0.0]
+    n = replace(n, images=replace(n.images, position=away), points=replace(n.points, coordinates=np.full((24, 3), np.nan)))
+    assert (with_control(n, table(tmp_path, text)).points.roles == CONTROL).sum() == 3
 
 
 def test_no_file(tmp_path):

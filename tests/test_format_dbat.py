@@ -1,5 +1,6 @@
 """DBAT scripts and PhotoModeler exports that cannot be used: one message with file, line and culprit."""
 
+import re
 import shutil
 
 import pytest
@@ -48,6 +49,45 @@ FIRST = " 1,    2, 1429.1871, 1456.4278, 0.1"
         ("camcaldemo.xml", "<?xml version", "<!DOCTYPE a [<!ENTITY b 'c'>]><?xml version", r"entity declaration is not accepted"),
         ("camcaldemo.xml", "<skew>false</skew>", "<swirl>false</swirl>", r"<swirl>false</swirl> is not known"),
         ("camcaldemo.xml", 'base_dir="$HERE"', 'base_dir="$DBAT"', r"folder '\$DBAT' is not known"),
+        ("camcaldemo.xml", "<nK>3</nK>", "<nK>x</nK>", r"""<nK> is not a whole number: 'x'"""),
+        ("camcaldemo.xml", "<nK>3</nK>", "<nK>4</nK>", r"""<nK> must be 0, 1, 2, 3, not 4"""),
+        ("camcaldemo.xml", "<nP>2</nP>", "<nP>1.5</nP>", r"""<nP> is not a whole number: '1.5'"""),
+        ("camcaldemo.xml", "<nP>2</nP>", "<nP>1</nP>", r"""<nP> must be 0, 2, not 1"""),
+        ("camcaldemo.xml", 'min_rays="2"', 'min_rays="two"', r"""min_rays is not a whole number: 'two'"""),
+        ("camcaldemo.xml", 'min_rays="2"', 'min_rays="-1"', r"""min_rays must be between 0 and 1000, not -1"""),
+        ("camcaldemo.xml", "<aspect>1</aspect>", "<aspect>1</aspect><skew>x</skew>", r"""<skew> is not a list of numbers"""),
+        ("camcaldemo.xml", "<aspect>1</aspect>", "<aspect>1</aspect><K>1,2,3,4</K>", r"""<K> has more than 3 values"""),
+        ("camcaldemo.xml", "<aspect>1</aspect>", "<aspect>1</aspect><P>1,2,3</P>", r"""<P> has more than 2 values"""),
+        ("camcaldemo.xml", "<focal>7.5</focal>", "<focal>7_5</focal>", r"""<focal> is not a list of numbers"""),
+        ("camcaldemo.xml", "<focal>7.5</focal>", "<focal>٧.5</focal>", r"""<focal> is not a list of numbers"""),
+        ("camcaldemo.xml", "<all>default</all>", "<all>banana</all>", r"""'banana' is not known; known are default, loaded"""),
+        ("camcaldemo.xml", "<all>default</all>", "<cc>default</cc>", r"""<cc> is not known; known are default, loaded"""),
+        ("camcaldemo.xml", "</camera>", "</camera><camera/>", r"""<cameras> has 2 cameras"""),
+        ("camcaldemo.xml", "<unit>mm</unit>", "<unit>px</unit>", r"""must be mm, not 'px'"""),
+        ("camcaldemo.xml", ">spatial_resection<", ">magic<", r"""operation 'magic' is not known"""),
+        (
+            "camcaldemo.xml",
+            "<operation>spatial_resection</operation>",
+            "<operation><magic/></operation>",
+            r"""operation <magic> is not known""",
+        ),
+        ("camcaldemo.xml", "<operation>spatial_resection</operation>", "<task/>", r"""element <task> of <operations> is not known"""),
+        (
+            "camcaldemo.xml",
+            'format="im,id,x,y,sxy"',
+            'format="im,id,x,y,ignored"',
+            r"""column 'sxy' .or 'sx' and 'sy'. is missing in format='im,id,x,y,ignored'""",
+        ),
+        ("camcaldemo.xml", 'format="im,id,x,y,sxy"', 'format="im,id,x,x,sxy"', r"""column 'x' appears twice in format"""),
+        ("camcaldemo.xml", 'format="im,id,x,y,sxy"', 'format="im,ignored,x,y,sxy"', r"""column 'id' is missing in format"""),
+        ("camcaldemo.xml", 'format="id,label,x,y,z"', 'format="id,label,x,y,ignored"', r"""column 'z' is missing in format"""),
+        ("camcaldemo.xml", 'format="id,path"', 'format="ignored,path"', r"""column 'id' is missing in format"""),
+        ("camcaldemo.xml", 'format="id,path"', 'format="id,ignored"', r"""column 'path' is missing in format"""),
+        (MARKS, FIRST, " 1,    2, 1_429.1871, 1456.4278, 0.1", r"line 3: x is not a number: '1_429.1871'"),
+        (MARKS, FIRST, " 1,    2, \u0661429.1871, 1456.4278, 0.1", r"line 3: x is not a number"),
+        (MARKS, FIRST, " 1,    2, 1429.1871, 1456.4278, 1e200", r"line 3: a standard deviation = 1e\+200 does not lie"),
+        (MARKS, FIRST, " 1,    2\x07, 1429.1871, 1456.4278, 0.1", r"markpts.txt, line 3: the line holds a control character"),
+        (MARKS, FIRST, " 1,    2\t3, 1429.1871, 1456.4278, 0.1", r"markpts.txt, line 3: point id '2.t3' holds a control character"),
         ("camcaldemo.xml", "<image_pts>", "<lidar/><image_pts>", r"element <lidar> of <input> is not known"),
     ],
 )
@@ -106,6 +146,13 @@ def test_truncated_exports(data, tmp_path):
         (2, " 0.000500 20\n", r"line 2: the image size in pixels is missing"),
         (4, "123.9392 26.5770 x 53 77 0 0 0 0 0\n", r"line 4: camera value is not a number: 'x'"),
         (7, "   0 -118.673  109.359 nan  -89.917   -0.420    0.784\n", r"line 7: exterior orientation is not finite"),
+        (2, " 0.000500 20 0 12996\n", r"line 2: the image size in pixels must be positive"),
+        (4, "0 26.5770 38.8 53 77 0 0 0 0 0\n", r"line 4: the principal distance must be positive"),
+        (4, "123 26.5770 38.8 53 -77 0 0 0 0 0\n", r"line 4: the format size must be positive"),
+        (4, "1_23 26.5770 38.8 53 77 0 0 0 0 0\n", r"line 4: camera value is not a number"),
+        (12, "   0 again.jpg\n", r"line 12: photo '0' appears twice \(first in line 6\)"),
+        (117, "   4   14  1.0 2.0 1e200 1.0\n   4   14  1.0 2.0 1.0 1.0\n", r"line 117: a standard deviation of a mark = 1e\+200"),
+        (117, "   4   14  1.0 2.0 1.0 1.0\n   4   14  1.0 2.0 1.0 1.0\n", r"measured twice in photo '4' \(first in line 1\d\d\)"),
         (40, "     351  771.7 14.7\n", r"line 40: 3 fields where 7"),
     ],
 )
@@ -126,3 +173,28 @@ def test_recognised_by_content(data, camcal, tmp_path):
     copy = tmp_path / "other.name"
     shutil.copy(camcal, copy)
     assert recognise(copy).name == "dbat"
+
+
+def test_an_export_cut_within_its_marks_is_refused(data, tmp_path):
+    raw = (data("dbat_sxb") / "pm" / "w-op0-with-orient-pmexport.txt").read_bytes()
+    path = tmp_path / "cut.txt"
+    lines = raw.splitlines(keepends=True)
+    assert not lines[117].strip() and len(lines[116].split()) == 6
+    marks = len(b"".join(lines[:117]))
+    for end in [*range(marks - 400, marks, 3), marks]:
+        path.write_bytes(raw[:end])
+        with pytest.raises(InputError, match=r"cut.txt, line 1\d\d: (the blank line that ends this section is missing|\d fields)"):
+            read(path, format="photomodeler")
+
+
+@pytest.mark.parametrize("folder", ["dbat_camcal", "dbat_sxb"])
+def test_all_exports_at_hand_are_read(data, folder):
+    for path in sorted((data(folder) / "pm").glob("*.txt")):
+        assert len(read(path, format="photomodeler").observations[0]) > 40
+
+
+def test_labels_of_any_script(script):
+    for file in (MARKS, IMAGES):
+        path = script.parent / file
+        path.write_text(re.sub(r"(?m)^ *1,", "\u0418\u0437\u2028\u5716 1,", path.read_text()), encoding="utf-8")
+    assert "\u0418\u0437\u2028\u5716 1" in read(script).images.labels

@@ -1,5 +1,6 @@
 """Our own project format: the round trip is exact, hostile and broken input is refused with file and line."""
 
+import os
 import random
 import re
 import time
@@ -148,7 +149,9 @@ def test_round_trip_of_an_adjusted_network_gives_the_same_adjustment(tmp_path):
     assert adjust(again).variance_factor == pytest.approx(result.variance_factor, rel=1e-12)
 
 
-hostile = st.text(alphabet=st.characters(exclude_categories=["Cs"]), min_size=1, max_size=12)
+hostile = st.text(
+    alphabet=st.characters(exclude_categories=["Cs"], exclude_characters=[*map(chr, range(32)), "\x7f"]), min_size=1, max_size=12
+)
 number = st.floats(allow_nan=False, allow_infinity=False)
 
 
@@ -157,7 +160,7 @@ number = st.floats(allow_nan=False, allow_infinity=False)
 def test_round_trip_of_hostile_labels_and_any_number(data, labels, tmp_path_factory):
     n = len(labels)
     array = lambda *shape: data.draw(hnp.arrays(float, shape, elements=number))  # noqa: E731
-    sigma = data.draw(hnp.arrays(float, (n, 2), elements=st.floats(1e-300, 1e300)))
+    sigma = data.draw(hnp.arrays(float, (n, 2), elements=st.floats(1e-12, 1e12)))
     camera = cameras.create(labels[0], cameras.model("pinhole"), {"principal_distance": 1.0, "principal_point_x": array(1)[0]})
     network = Network(
         (camera,),
@@ -436,6 +439,48 @@ BROKEN = {
         "not the same unit",
     ),
     "distance in mm": (edited("distances.csv", 2, "1,2,3001,1"), "distances.csv", 2, "in mm and not in m"),
+    "control and check points in mm, only cameras start": (
+        {
+            "points__csv": "point,role,X,Y,Z,sigma_X,sigma_Y,sigma_Z\n"
+            "1,control,0,0,0,1,1,1\n2,control,1200,0,0,1,1,1\n3,check,0,1200,0,1,1,1\n4,,,,,,,\n5,,,,,,,\n",
+            "distances__csv": None,
+        },
+        "points.csv",
+        2,
+        "in mm and not in m",
+    ),
+    "number of 5000 digits": ({"project__toml": HEADER + f"[settings]\nmin_rays = {'9' * 5000}\n"}, "project.toml", 4, "too many digits"),
+    "number of 4000 digits": ({"project__toml": HEADER + f"[settings]\nimage_sigma = {'9' * 4000}\n"}, "project.toml", 4, "64 bits"),
+    "hexadecimal number": ({"project__toml": HEADER + f"[settings.source]\nk = [0x{'f' * 5000}]\n"}, "project.toml", 4, "64 bits"),
+    "coarse tolerance": ({"project__toml": HEADER + "[settings]\ntolerance = 0.011\n"}, "project.toml", 4, "settings.tolerance"),
+    "tolerance of zero": ({"project__toml": HEADER + "[settings]\ntolerance = 0.0\n"}, "project.toml", 4, "settings.tolerance"),
+    "negative rays": ({"project__toml": HEADER + "[settings]\nmin_rays = -1\n"}, "project.toml", 4, "settings.min_rays"),
+    "huge usual sigma": ({"project__toml": HEADER + "[settings]\nimage_sigma = 1e200\n"}, "project.toml", 4, "settings.image_sigma"),
+    "huge sigma of a group": ({"project__toml": HEADER + '[[groups]]\nname = "a"\nsigma = 1e200\n'}, "project.toml", 5, "groups.0.sigma"),
+    "tiny image sigma": (
+        {"image_points__csv": "image,point,x,y,sigma_x,sigma_y\nA,1,0,0,1,1\nA,2,0,0,1,1e-13\n"},
+        "image_points.csv",
+        3,
+        "the sigma of an image point = 1e-13 does not lie between",
+    ),
+    "huge sigma of control": (
+        edited("points.csv", 2, "1,control,0,0,0,0.01,1e200,0.02"),
+        "points.csv",
+        2,
+        "the sigma of a coordinate = 1e+200",
+    ),
+    "huge sigma of a camera": (
+        {"camera_parameters__csv": "camera,parameter,value,sigma\n1,principal_distance,1000,1e200\n"},
+        "camera_parameters.csv",
+        2,
+        "sigma = 1e+200",
+    ),
+    "huge sigma of an unknown": ({"unknowns__csv": "name,value,sigma\nimage A: X0,0,1e200\n"}, "unknowns.csv", 2, "sigma = 1e+200"),
+    "huge sigma of a distance": (edited("distances.csv", 2, "1,2,3.001,1e200"), "distances.csv", 2, "sigma of the distance = 1e+200"),
+    "digits of another script": (edited("distances.csv", 2, "1,2,\u0663.1,1"), "distances.csv", 2, "value is not a number"),
+    "control character in a label": (edited("images.csv", 2, "A\x1b[31m,0,0,10,0,0,0"), "images.csv", 2, "holds a control character"),
+    "line break in a label": (edited("images.csv", 3, '"B\nC",0,0,10,0,0,0'), "images.csv", 3, "holds a control character"),
+    "control character in a group": ({"project__toml": HEADER + '[[groups]]\nname = "a\\u007f"\n'}, "project.toml", 4, "control character"),
     "no header file": ({"project__toml": None}, "project.toml", None, "no such file"),
     "not TOML": ({"project__toml": HEADER + "name = \n"}, "project.toml", 3, "not a TOML file"),
     "other schema": ({"project__toml": 'name = "x"\nschema = "baarda.project/9"\n'}, "project.toml", 2, "schema"),
@@ -489,7 +534,7 @@ def test_broken_input_is_refused_with_file_and_line(name, tmp_path):
 
 
 def test_line_numbers_count_lines_within_quotes(tmp_path):
-    text = 'image,X0\n"A\n\nwith breaks",0\nA,1\n\nB,zwei\n'
+    text = 'image,X0\nA,"\n\n0"\nC,1\n\nB,zwei\n'
     with pytest.raises(InputError, match=r"images.csv, line 7: X0 is not a number: 'zwei'"):
         project.read(folder(tmp_path, images__csv=text))
 
@@ -596,3 +641,52 @@ def test_every_column_is_documented():
     names |= {*columns_of(AXES), *SettingsTable.model_fields, *GroupTable.model_fields, *Header.model_fields} - {"schema_"}
     missing = [name for name in sorted(names) if f"`{name}`" not in text]
     assert not missing
+
+
+def test_labels_with_control_characters_are_not_written(tmp_path):
+    n = ring()
+    with pytest.raises(UsageError, match="control character"):
+        project.write(replace(n, images=replace(n.images, labels=("a\tb", *n.images.labels[1:]))), tmp_path / "p")
+
+
+@pytest.mark.parametrize("name", ["project.toml", "points.csv"])
+def test_only_regular_files_are_opened(name, tmp_path):
+    where = folder(tmp_path)
+    (where / name).unlink()
+    os.mkfifo(where / name)
+    with pytest.raises(InputError, match=rf"{name}: not a regular file"):
+        formats.read(where, format="project")
+
+
+@pytest.mark.parametrize("format", [None, "project", "dbat", "photomodeler"])
+def test_pipes_and_devices_are_refused(format, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("/dev/zero")
+    for path in (tmp_path / "pipe", tmp_path / "link"):
+        with pytest.raises(InputError, match="not a regular file"):
+            formats.read(path, format=format)
+        with pytest.raises(InputError, match="not a regular file"):
+            formats.digest(path)
+
+
+def test_a_folder_is_not_a_file_to_read(tmp_path):
+    with pytest.raises(InputError, match="not a regular file"):
+        formats.read(tmp_path, format="dbat")
+
+
+def test_files_that_the_system_keeps_from_us(tmp_path, monkeypatch):
+    where = folder(tmp_path)
+
+    def refused(self, *args, **kwargs):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "open", refused)
+    for call in (formats.recognise, formats.read, formats.digest):
+        with pytest.raises(InputError, match=r"hand.*: cannot be read: Permission denied"):
+            call(where)
+    monkeypatch.setattr(Path, "read_bytes", refused)
+    with pytest.raises(InputError, match=r"project.toml: cannot be read: Permission denied"):
+        formats.read(where, format="project")
+    monkeypatch.setattr(Path, "stat", refused)
+    with pytest.raises(InputError, match="cannot be read: Permission denied"):
+        formats.recognise(where)

@@ -336,7 +336,8 @@ def _adjust_and_report(
     if out is not None and not quiet:
         typer.echo(f"report: {out / 'report.html'}", err=True)
     if not analysis.converged:
-        typer.echo(f"baarda: not converged after {len(result.history) - 1} iterations; nothing was tested", err=True)
+        steps = len(result.history) - 1
+        typer.echo(f"baarda: not converged after {steps} iterations, nothing was tested; {result.contradictions()}", err=True)
         raise typer.Exit(3)
     if strict and any(analysis.gates.values()):
         failed = ", ".join(name for name, rejected in analysis.gates.items() if rejected)

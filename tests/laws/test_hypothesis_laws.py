@@ -193,9 +193,8 @@ def test_decisions_agree_with_limits_of_simulated_laws(alpha, tail):
 
 def test_the_level_raises_the_number_of_replicas():
     """At level 0.001 a rejected null stays rejected: 999 replicas would not show it."""
-    from networks import ring
-
     import baarda
+    from networks import ring
 
     result = baarda.adjust(ring(control=5))
     for t in baarda.test(result, alpha=0.001):

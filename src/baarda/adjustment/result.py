@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,9 @@ from baarda.hypotheses.base import Estimates, Evidence
 from baarda.network import AXES, CHECK, ROLES, Network, State, Table, Unknowns
 from baarda.observations import CorrelatedPoints, Direct, ImagePoints, Kind
 
+if TYPE_CHECKING:
+    from baarda.adjustment.robust import LawOfErrors
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 Scaling = Literal["apriori", "aposteriori"]
@@ -29,7 +32,7 @@ Scaling = Literal["apriori", "aposteriori"]
 
 @dataclass(frozen=True)
 class Iteration:
-    """One step: v'Pv after it, the relative step, Levenberg's damping, and whether the step was taken."""
+    """One step: v'Pv (or, under a law of errors, minus the log-likelihood) after it, the relative step, damping, whether it was taken."""
 
     count: int
     objective: float
@@ -40,7 +43,10 @@ class Iteration:
 
 @dataclass(frozen=True)
 class Adjustment:
-    """A network adjusted by least squares.
+    """A network adjusted by least squares, or by maximum likelihood under another law of errors.
+
+    Under a law, `redundancy_numbers`, `qvv`, `controlled_share` and `residuals_of` still describe the geometry, that is the least-squares
+    adjustment of the same observations, but no longer the residuals: the evidence leaves them out.
 
     Attributes
     ----------
@@ -64,6 +70,8 @@ class Adjustment:
     aside : (points,) bool array
         Points set aside.
     assumptions : tuple of str
+    law : LawOfErrors or None
+        The law of errors of a maximum-likelihood adjustment with its values; None for least squares.
     """
 
     network: Network
@@ -80,6 +88,7 @@ class Adjustment:
     aside: NDArray[np.bool_]
     assumptions: tuple[str, ...]
     shift: Floats
+    law: LawOfErrors | None = None
 
     # ---- numbers of the whole ----
     @property
@@ -103,9 +112,17 @@ class Adjustment:
         return float(np.sqrt(self.variance_factor))
 
     def scale(self, sigma: Scaling) -> float:
-        """Return sigma0 a priori (1) or a posteriori."""
+        """Return sigma0 a priori (1) or a posteriori: what the roots of cofactors are multiplied with.
+
+        Under a law of errors the root of its covariance factor; a priori with the law's standard deviation (its scale, where it has none)
+        taken as 1 instead of as estimated.
+        """
         if sigma not in ("apriori", "aposteriori"):
             raise UsageError(f"sigma must be 'apriori' or 'aposteriori', not {sigma!r}")
+        if self.law is not None:
+            deviation = self.law.distribution.std()
+            size = deviation if np.isfinite(deviation) else self.law.scale
+            return float(np.sqrt(self.law.covariance_factor)) / (size if sigma == "apriori" else 1.0)
         return 1.0 if sigma == "apriori" else self.sigma0
 
     # ---- observations ----
@@ -192,7 +209,10 @@ class Adjustment:
 
     @cached_property
     def observations(self) -> Table:
-        """One row per scalar observation: group, image, point, component, observed, sigma, residual, redundancy."""
+        """One row per scalar observation: group, image, point, component, observed, sigma, residual, redundancy.
+
+        Under a law of errors the redundancy numbers, which are not applicable, are NaN, and the weights of the last iteration are added.
+        """
         codes = self._codes()
         images, points = (
             np.array([*self.network.images.labels, ""], dtype=object),
@@ -201,6 +221,7 @@ class Adjustment:
         observed = np.concatenate([g.observed().ravel() for g in self.groups])
         direct = np.concatenate([np.full(len(g) * len(g.components), isinstance(g, (Direct, CorrelatedPoints))) for g in self.groups])
         observed = observed - np.where(direct, self._shift_of(codes), 0.0)
+        weight = {} if self.law is None else {"weight": self.law.weights}
         return Table(
             {
                 "group": np.array([g.name for g in self.groups], dtype=object)[codes["group"]],
@@ -210,8 +231,9 @@ class Adjustment:
                 "observed": observed,
                 "sigma": self.sigmas,
                 "residual": self.residuals,
-                "redundancy": self.redundancy_numbers,
+                "redundancy": self.redundancy_numbers if self.law is None else np.full(self.count, np.nan),
             }
+            | weight
         )
 
     def _shift_of(self, codes: dict[str, Any]) -> Floats:
@@ -357,14 +379,18 @@ class Adjustment:
 
     @cached_property
     def evidence(self) -> Evidence:
-        """Everything that tests may ask for."""
+        """Everything that tests may ask for.
+
+        Under a law of errors only what holds there: residuals, and estimates with a variance factor (covariance factor of the law), so that
+        tests of parameters and of check points are Wald tests. `baarda.adjustment.robust.NOT_APPLICABLE` lists the tests to leave out.
+        """
         codes = self._codes()
         names = tuple(dict.fromkeys(codes["component"].tolist()))
         index = {name: i for i, name in enumerate(names)}
         image_rows = np.concatenate([np.full(len(g) * len(g.components), isinstance(g, ImagePoints)) for g in self.groups])
         interior = self.camera_estimates
         additional = self._camera_estimates(additional_only=True)
-        return Evidence(
+        evidence = Evidence(
             residuals=self.residuals,
             sigmas=self.sigmas,
             vpv=self.objective,
@@ -387,6 +413,18 @@ class Adjustment:
             check=self._check_estimates(),
             control=self._control_estimates(),
             residuals_of=self.residuals_of,
+        )
+        if self.law is None:
+            return evidence
+        return replace(
+            evidence,
+            vpv=self.law.covariance_factor * self.redundancy,
+            qvv=None,
+            redundancy_numbers=None,
+            pv=None,
+            pqvvp=None,
+            control=None,
+            residuals_of=None,
         )
 
     @cached_property
@@ -518,6 +556,16 @@ class Adjustment:
                 for row in np.flatnonzero(~group.in_front(self.network, state)):
                     out.append((self.network.images.labels[group.images[row]], self.network.points.labels[group.points[row]]))
         return out
+
+    def contradictions(self, count: int = 3) -> str:
+        """Return in words the observations with the largest |v / sigma|: where to look when an adjustment does not converge."""
+        size = np.abs(self.residuals / self.sigmas)
+        codes, out = self._codes(), []
+        for row in np.argsort(-size, kind="stable")[:count]:
+            named = (("image", self.network.images.labels), ("point", self.network.points.labels))
+            place = [f"{kind} {labels[codes[kind][row]]}" for kind, labels in named if codes[kind][row] >= 0]
+            out.append(" ".join([*place, str(codes["component"][row])]) + f" ({size[row]:.3g})")
+        return "largest |v / sigma|: " + ", ".join(out)
 
     def with_assumptions(self, *more: str) -> Adjustment:
         """Return the result with further assumptions for the report."""

@@ -17,6 +17,7 @@ from baarda.adjustment.initial import complete
 from baarda.adjustment.kernels import Solver
 from baarda.adjustment.linearize import Linearization, check_finite, linearize, whitened_misclosures
 from baarda.adjustment.result import Adjustment, Iteration
+from baarda.adjustment.robust import adjust_under_law, check_law
 from baarda.cameras import FIXED, FREE
 from baarda.errors import DatumDefect, RedundancyNotPositive, UsageError
 from baarda.network import CHECK, Network, State, Unknowns, unknowns_of
@@ -50,6 +51,11 @@ class Settings:
         Replaces the a-priori sigma of all image points, pixels.
     residual_plane : {"image", "corrected"} or None
         Replaces that of the source.
+    robust : str or None
+        Law of errors of a maximum-likelihood adjustment, a name of `baarda.distributions.laws`; None is least squares.
+    robust_shapes : mapping or None
+        Shapes of that law by name, for instance ``{"nu": 4.0}``. Those not given are estimated from the residuals of the least-squares
+        start (a of the modulated normal, nu of Student's law) or take their usual value.
     progress : callable or None
         Is told every iteration.
     """
@@ -62,16 +68,24 @@ class Settings:
     camera: tuple[str, ...] | None = None
     image_sigma: float | None = None
     residual_plane: str | None = None
+    robust: str | None = None
+    robust_shapes: Mapping[str, float] | None = field(default=None, hash=False)
     progress: Callable[[Iteration], None] | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         for name, allowed in (("datum", ("auto", "control", "inner", "minimal")), ("solver", ("auto", "dense", "block"))):
             if getattr(self, name) not in allowed:
                 raise UsageError(f"{name} must be one of {', '.join(allowed)}, not {getattr(self, name)!r}")
-        if self.iterations < 1 or not self.tolerance > 0:
-            raise UsageError("iterations and tolerance must be positive")
-        if self.image_sigma is not None and not self.image_sigma > 0:
-            raise UsageError(f"the image sigma must be positive, not {self.image_sigma}")
+        if self.iterations < 1 or not 0 < self.tolerance < 1e-2:
+            raise UsageError("iterations must be positive, the tolerance between 0 and 0.01")
+        if self.min_rays < 0:
+            raise UsageError(f"min_rays must not be negative, not {self.min_rays}")
+        if self.image_sigma is not None and not 1e-12 < self.image_sigma < 1e12:
+            raise UsageError(f"the image sigma (--image-sigma) must be positive, between 1e-12 and 1e12 px, not {self.image_sigma}")
+        if self.robust is not None:
+            check_law(self.robust, self.robust_shapes)
+        elif self.robust_shapes:
+            raise UsageError("robust_shapes are shapes of the law that robust names; none is named")
 
     @staticmethod
     def of(network: Network, options: Mapping[str, Any]) -> Settings:
@@ -85,7 +99,7 @@ class Settings:
 
 
 def adjust(network: Network, **options: Any) -> Adjustment:
-    """Adjust a network by least squares.
+    """Adjust a network by least squares, or by maximum likelihood under another law of errors.
 
     Parameters
     ----------
@@ -141,6 +155,11 @@ def _adjust(network: Network, settings: Settings) -> Adjustment:
 
     datum = choose_datum(defect, lin, settings, prepared)
     state, lin, history, converged = _iterate(prepared, start, lin, groups, datum, factor, settings)
+    law = None
+    if settings.robust is not None:
+        found = adjust_under_law(prepared, state, lin, groups, datum, factor, settings, redundancy, history)
+        state, lin, history, converged, law = found
+        more = [*more, *law.assumptions]
     datum = choose_datum(find_defect(lin, state) if defect.count else defect, lin, settings, prepared)
     solver = factor(lin, datum)
     adjusted = state.write_to(prepared).shifted(-shift)
@@ -159,6 +178,7 @@ def _adjust(network: Network, settings: Settings) -> Adjustment:
         aside=aside,
         assumptions=(*network.assumptions, *notes, *more),
         shift=shift,
+        law=law,
     )
 
 
@@ -211,6 +231,10 @@ def prepare(network: Network, settings: Settings) -> tuple[Network, NDArray[np.b
         aside &= known
     _say(notes, network, ~measured & aside, "without any observation, left out")
     _say(notes, network, measured & aside, f"with fewer than {settings.min_rays} rays, set aside")
+    for group in network.observations:
+        lost = np.any([aside[end] for end in group.points_of()], axis=0)
+        if lost.any() and not isinstance(group, ImagePoints):
+            notes.append(f"{int(lost.sum())} of {len(group)} {group.name} end at points set aside and are left out with them")
     blind = np.flatnonzero(~seen & (network.images.states == FREE).any(axis=1))
     if len(blind):
         names = ", ".join(network.images.labels[i] for i in blind[:12])
@@ -303,7 +327,7 @@ def _iterate(
     objective = float(lin.misclosure @ lin.misclosure)
     floor = lin.count * 1e-8  # residuals of 1e-4 sigma count as none
     history = [Iteration(0, objective, None, 0.0, True)]
-    damping, growth, last = 0.0, 2.0, np.inf
+    damping, growth, last, curved = 0.0, 2.0, np.inf, False
 
     def misclosures(step: Floats) -> tuple[State, Floats, float]:
         trial = state.moved(lin.unknowns, step)
@@ -327,17 +351,25 @@ def _iterate(
         if settings.progress is not None:
             settings.progress(history[-1])
         if not accepted:
+            curved |= relative < 1e-3  # large residuals bend the problem so much that full steps fail even beside the solution
             damping, growth, last = max(damping * growth, 1e-7), 2.0 * growth, np.inf
             continue
         state, objective = trial, value
         lin = linearize(network, state, lin.unknowns, groups)
-        if damping == 0.0 and (relative <= settings.tolerance or (relative <= 1e-7 and relative >= 0.5 * last)):
+        settled = relative <= settings.tolerance or (relative <= 1e-7 and relative >= 0.5 * last)
+        if settled and (damping == 0.0 or _full_step(lin, datum, factor) <= 1e-6):
             return state, lin, history, True
-        damping *= max(0.2, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
-        if damping < 1e-9 or relative < 1e-4:
+        damping *= max(0.5 if curved else 0.2, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
+        if damping < 1e-9 or (relative < 1e-4 and not curved):
             damping = 0.0
         growth, last = 2.0, relative
     return state, lin, history, False
+
+
+def _full_step(lin: Linearization, datum: Datum, factor: Callable[..., Solver]) -> float:
+    """Return the relative step that would be taken without damping."""
+    change = lin.design @ factor(lin, datum).solve(lin.design.T @ lin.misclosure)
+    return float(np.linalg.norm(change) / max(np.linalg.norm(lin.misclosure), 1e-4 * np.sqrt(lin.count)))
 
 
 def _bent(

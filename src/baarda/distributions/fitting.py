@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy import optimize, special
 
 from baarda.distributions import law as find_law
-from baarda.distributions.base import Law
+from baarda.distributions.base import Floats, Law
 from baarda.distributions.class_fitting import fit_classes
 from baarda.distributions.condensed import Condensed
 from baarda.distributions.histogram import check_edges, count
@@ -35,6 +35,7 @@ def fit(
     edges: ArrayLike | None = None,
     ends: Literal["open", "closed"] = "open",
     alpha: float = 0.05,
+    polish: bool = False,
 ) -> Fit:
     """Fit a law to values.
 
@@ -59,6 +60,8 @@ def fit(
         End classes of these rules.
     alpha : float
         Level of their chi-square.
+    polish : bool
+        Whether a maximum-likelihood fit to condensed values ends with one Newton step on all values (not on `Condensed`, which has none).
 
     Returns
     -------
@@ -67,13 +70,15 @@ def fit(
     Raises
     ------
     UsageError
-        If values are missing, not finite, too few for the parameters, or all equal.
+        If values are missing, not finite, too few for the parameters, or all equal; if `polish` is asked for without the values or for
+        another rule.
 
     Notes
     -----
-    From 20 000 values on, the likelihood is summed over `Condensed` bins. The modulated normal's likelihood with a free mean is unbounded
-    for a <= -1/2 and its location information infinite for a <= -1/4, hence the bound. Standard errors come from the observed information
-    where log f is smooth, else from the outer products of the scores.
+    From 20 000 values on, the likelihood is summed over `Condensed` bins, first wide, then narrow ones: the estimates are within about
+    1e-5 of a standard error of those from all values, and the polished ones closer still. The modulated normal's likelihood with a free
+    mean is unbounded for a <= -1/2 and its location information infinite for a <= -1/4, hence the bound. Standard errors come from the
+    observed information where log f is smooth, else from the outer products of the scores.
 
     Examples
     --------
@@ -85,6 +90,8 @@ def fit(
     True
     """
     member = find_law(law) if isinstance(law, str) else law
+    if polish and (isinstance(values, Condensed) or rule != "maximum_likelihood"):
+        raise UsageError("polish is a step of maximum likelihood on all values, not on condensed ones")
     if isinstance(values, Condensed):
         return _fit_sample(member, Sample.of_condensed(values), rule, loc, scale, shapes, lower_a)
     x = check_values(values)
@@ -94,7 +101,8 @@ def fit(
         b = check_edges(edges)
         counts = count(x, b, ends)
         return fit_classes(counts, b, member, rule=rule, loc=loc, scale=scale, shapes=shapes, ends=ends, alpha=alpha)
-    return _fit_sample(member, Sample.of(x, float(np.mean(x)) if loc is None else float(loc)), rule, loc, scale, shapes, lower_a)
+    sample = Sample.of(x, float(np.mean(x)) if loc is None else float(loc))
+    return _fit_sample(member, sample, rule, loc, scale, shapes, lower_a, x if polish and sample.source is not None else None)
 
 
 def _fit_sample(
@@ -105,6 +113,7 @@ def _fit_sample(
     scale: float | None,
     shapes: Mapping[str, float] | None,
     lower_a: float | None,
+    values: Floats | None = None,
 ) -> Fit:
     given = given_values(member, loc, scale, shapes)
     free = tuple(name for name in member.parameter_names if name not in given)
@@ -120,7 +129,7 @@ def _fit_sample(
         )
     if rule != "maximum_likelihood":
         raise UsageError(f"no rule named {rule!r} for these values")
-    return maximise(member, sample, given, free, lower_a)
+    return maximise(member, sample, given, free, lower_a, values)
 
 
 def profile_interval(

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import optimize
+from threadpoolctl import ThreadpoolController
 
 from baarda.distributions.base import Floats, Law, Shape
 from baarda.distributions.result import Fit
 from baarda.distributions.sample import Sample
+from baarda.distributions.tabulated import log_likelihood, log_likelihood_gradient
 
 _SMALL = 200
 _LARGE = 5000
@@ -164,15 +169,47 @@ def problem_of(member: Law, sample: Sample, given: Mapping[str, float], free: tu
     return Problem(member, sample, given, free, sd if sd > 0.0 else 1.0, lower_a)
 
 
-def maximise(member: Law, sample: Sample, given: Mapping[str, float], free: tuple[str, ...], lower_a: float | None = None) -> Fit:
-    """Return the maximum-likelihood fit to a sample, with some parameters given."""
+def maximise(
+    member: Law,
+    sample: Sample,
+    given: Mapping[str, float],
+    free: tuple[str, ...],
+    lower_a: float | None = None,
+    values: Floats | None = None,
+) -> Fit:
+    """Return the maximum-likelihood fit to a sample, with some parameters given.
+
+    With the `values` that a condensed sample stands for, one Newton step on all of them follows.
+    """
+    with _blas().limit(limits=1, user_api="blas"):  # the matrices are tiny: more threads only wait for one another
+        return _maximise(member, sample, given, free, lower_a, values)
+
+
+@cache
+def _blas() -> Any:
+    return ThreadpoolController()
+
+
+def _maximise(
+    member: Law, sample: Sample, given: Mapping[str, float], free: tuple[str, ...], lower_a: float | None, values: Floats | None
+) -> Fit:
+    folded = member.distribution.symmetric and given.get("loc") == sample.centre
+    sample = sample.reduced(folded=folded, coarse=False)
     problem = problem_of(member, sample, given, free, lower_a)
+    rough = replace(problem, sample=sample.reduced(folded=folded, coarse=True))
     notes: list[str] = []
     if not free:
         distribution = member.with_values(problem.values(np.zeros(0)))
-        return Fit(member.name, distribution, "maximum_likelihood", (), sample.n, sample.log_likelihood(distribution))
+        total = sample.log_likelihood(distribution) if values is None else log_likelihood(values, distribution)
+        return Fit(member.name, distribution, "maximum_likelihood", (), sample.n, total)
     closed = _closed_form(problem) if set(free) <= {"loc", "scale"} else None
-    theta, best = closed or _best_of_starts(problem)
+    information = None
+    if closed is not None:
+        theta, best = closed
+    elif rough.sample is sample:
+        theta, best = _best_of_starts(problem)
+    else:
+        theta, best, information = _by_levels(problem, rough)
     if closed is None and "loc" in free:
         theta, best = _try_points(problem, theta, best)
     shapes = problem.shapes()
@@ -188,7 +225,7 @@ def maximise(member: Law, sample: Sample, given: Mapping[str, float], free: tupl
             rest = replace(problem, given=dict(problem.given) | {name: np.inf}, free=tuple(f for f in free if f != name))
             found, value = rest.minimise(np.delete(limit, i)) if rest.free else (np.zeros(0), rest.cost(np.zeros(0))[0])
             if value <= best + 1e-12:
-                theta, best = np.insert(found, i, 0.0), value
+                theta, best, information = np.insert(found, i, 0.0), value, None
         low, high = problem.bounds()[i]
         if theta[i] == low or theta[i] == high:
             at_bounds.append(name)
@@ -196,14 +233,19 @@ def maximise(member: Law, sample: Sample, given: Mapping[str, float], free: tupl
             notes.append(
                 f"{name} = {value:g} is the bound of its range" + (": the normal law fits best" if name == "a" and np.isinf(value) else "")
             )
+    if information is None:
+        information = _information(rough, theta)
+    total = -best * sample.n
+    if values is not None:
+        theta, total = _polish(problem, information, theta, tuple(at_bounds), values)
     return Fit(
         member.name,
         member.with_values(problem.values(theta)),
         "maximum_likelihood",
         free,
         sample.n,
-        -best * sample.n,
-        _standard_errors(problem, theta, tuple(at_bounds)),
+        total,
+        _standard_errors(problem, information, theta, tuple(at_bounds)),
         at_bounds=tuple(at_bounds),
         notes=tuple(notes),
     )
@@ -220,7 +262,7 @@ def _closed_form(problem: Problem) -> tuple[Floats, float] | None:
     return theta, problem.cost(theta)[0]
 
 
-def _best_of_starts(problem: Problem) -> tuple[Floats, float]:
+def _best_of_starts(problem: Problem, *, polish: bool = True) -> tuple[Floats, float]:
     """Start from moments at a few shapes, search from the best two."""
     sample, given = problem.sample, problem.given
     mean, sd, _ = sample.moments(given.get("loc"))
@@ -237,11 +279,79 @@ def _best_of_starts(problem: Problem) -> tuple[Floats, float]:
             unit = problem.member.with_values(values | {"scale": 1.0}).std()
             values["scale"] = sd / unit if np.isfinite(unit) and unit > 0.0 else sd
         theta = problem.coordinates(values)
-        starts.append((problem.cost(theta)[0], tuple(theta)))
+        starts.append((-problem.sample.log_likelihood(problem.member.with_values(problem.values(theta))) / sample.n, tuple(theta)))
     starts.sort()
     # in small samples the likelihood may have a second maximum in the shape
-    results = [problem.minimise(np.array(theta)) for _, theta in starts[: 2 if sample.n < _LARGE else 1]]
+    results = [problem.minimise(np.array(theta), polish=polish) for _, theta in starts[: 2 if sample.n < _LARGE else 1]]
     return min(results, key=lambda r: r[1])
+
+
+def _by_levels(problem: Problem, rough: Problem) -> tuple[Floats, float, Floats | None]:
+    """Search on wide bins, then a few Newton steps on the narrow ones with the curvature of the wide ones, which is returned too."""
+    theta, _ = _best_of_starts(rough, polish=False)
+    if "loc" in problem.free and _smoothness(problem, theta) == 0:
+        return *problem.minimise(theta), None
+    inside = _inside(problem, theta)
+    information = _information(rough, theta)
+    curvature = information[np.ix_(inside, inside)]
+    if not _positive(curvature):
+        return *problem.minimise(theta), None
+    best, slope = problem.cost(theta)
+    for _ in range(8):
+        step = -np.linalg.solve(curvature, slope[inside])
+        trial = theta.copy()
+        trial[inside] += step
+        if not np.array_equal(inside, _inside(problem, trial)):
+            return *problem.minimise(theta), None
+        value, new = problem.cost(trial)
+        if not value <= best + 1e-14 * abs(best):
+            break
+        theta, best, slope = trial, min(value, best), new
+        if step @ curvature @ step * problem.sample.n < 1e-8:  # 1e-4 of a standard error; the next one is far smaller
+            break
+    return theta, best, information
+
+
+def _polish(problem: Problem, information: Floats, theta: Floats, at_bounds: tuple[str, ...], values: Floats) -> tuple[Floats, float]:
+    """Take one Newton step on the likelihood of all values; return where it leads and the log-likelihood there."""
+    now = problem.values(theta)
+    total, gradient = log_likelihood_gradient(values, problem.member.with_values(now))
+    inside = _inside(problem, theta) & np.array([name not in at_bounds for name in problem.free])
+    curvature = values.size * information[np.ix_(inside, inside)]
+    if not _positive(curvature):
+        return theta, total
+    slope = np.array([gradient[problem.free[i]] * _rate(problem, problem.free[i], theta[i]) for i in np.flatnonzero(inside)])
+    trial = theta.copy()
+    trial[inside] += np.linalg.solve(curvature, slope)
+    if not np.array_equal(inside, _inside(problem, trial) & inside):
+        return theta, total
+    return trial, total + 0.5 * float(slope @ (trial - theta)[inside])
+
+
+def _inside(problem: Problem, theta: Floats) -> NDArray[np.bool_]:
+    """Which coordinates are not on a bound of their range, or beyond."""
+    return np.array([low < t < high for (low, high), t in zip(problem.bounds(), theta, strict=True)])
+
+
+def _positive(matrix: Floats) -> bool:
+    return bool(np.all(np.isfinite(matrix)) and matrix.size and np.min(np.linalg.eigvalsh(matrix)) > 0.0)
+
+
+def _information(problem: Problem, theta: Floats) -> Floats:
+    """Second derivatives of the cost; where log f is not smooth enough for a free centre, mean products of the slopes."""
+    if "loc" not in problem.free or _smoothness(problem, theta) == 2:
+        return problem.hessian(theta)
+    slopes = problem.terms(theta)[1]
+    return np.array([[problem.sample.sum(a * b) for b in slopes] for a in slopes]) / problem.sample.n
+
+
+def _rate(problem: Problem, name: str, coordinate: float) -> float:
+    """Derivative of a parameter by its coordinate."""
+    if name == "loc":
+        return problem.unit
+    if name == "scale":
+        return problem.unit * float(np.exp(coordinate))
+    return float(problem.shapes()[name].slope(coordinate))
 
 
 def _smoothness(problem: Problem, theta: Floats) -> int:
@@ -278,29 +388,16 @@ def _try_points(problem: Problem, theta: Floats, best: float) -> tuple[Floats, f
     return theta, best
 
 
-def _standard_errors(problem: Problem, theta: Floats, at_bounds: tuple[str, ...]) -> dict[str, float | None]:
+def _standard_errors(problem: Problem, information: Floats, theta: Floats, at_bounds: tuple[str, ...]) -> dict[str, float | None]:
     inside = [i for i, name in enumerate(problem.free) if name not in at_bounds]
     errors: dict[str, float | None] = dict.fromkeys(problem.free)
     if not inside:
         return errors
-    n = problem.sample.n
-    if "loc" in problem.free and _smoothness(problem, theta) < 2:
-        slopes = problem.terms(theta)[1]
-        information = np.array([[problem.sample.sum(slopes[i] * slopes[j]) for j in inside] for i in inside])
-    else:
-        information = n * problem.hessian(theta)[np.ix_(inside, inside)]
-    if not np.all(np.isfinite(information)) or np.min(np.linalg.eigvalsh(information)) <= 0.0:
+    kept = problem.sample.n * information[np.ix_(inside, inside)]
+    if not _positive(kept):
         return errors
-    covariance = np.linalg.inv(information)
-    shapes = problem.shapes()
+    covariance = np.linalg.inv(kept)
     for k, i in enumerate(inside):
         name = problem.free[i]
-        rate = (
-            problem.unit
-            if name == "loc"
-            else problem.values(theta)["scale"]
-            if name == "scale"
-            else abs(float(shapes[name].slope(theta[i])))
-        )
-        errors[name] = float(np.sqrt(covariance[k, k]) * rate)
+        errors[name] = float(np.sqrt(covariance[k, k]) * abs(_rate(problem, name, float(theta[i]))))
     return errors

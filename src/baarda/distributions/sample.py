@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from baarda.distributions.base import Distribution, Floats, Law
-from baarda.distributions.condensed import Condensed, condense
+from baarda.distributions.condensed import PER_OCTAVE, Condensed, condense
 from baarda.errors import UsageError
 
 CONDENSE_FROM = 20_000
+_COARSE = 8
 
 
 def check_values(values: ArrayLike) -> Floats:
@@ -47,6 +48,7 @@ class Sample:
     centre: float
     n: int
     has_centre: bool
+    source: Condensed | None = None
 
     @classmethod
     def of(cls, values: Floats, centre: float) -> Sample:
@@ -60,7 +62,14 @@ class Sample:
     def of_condensed(cls, condensed: Condensed) -> Sample:
         """Take condensed values."""
         points, weights = condensed.points()
-        return cls(points, weights, condensed.centre, condensed.n, bool(np.any(points == 0.0)))
+        return cls(points, weights, condensed.centre, condensed.n, bool(np.any(points == 0.0)), condensed)
+
+    def reduced(self, *, folded: bool, coarse: bool) -> Sample:
+        """Return the same values on fewer points: both sides together, and perhaps 8 bins an octave; itself where they are few."""
+        if self.source is None or not (folded or coarse):
+            return self
+        points, weights = self.source.points(folded=folded, per_octave=_COARSE if coarse else PER_OCTAVE)
+        return replace(self, points=points, weights=weights)
 
     def sum(self, terms: Floats) -> float:
         """Weighted sum of a term per point."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from baarda.discover import members
 from baarda.errors import InputError, UsageError
-from baarda.formats.base import Format
+from baarda.formats.base import Format, regular_size, unreadable
 from baarda.network import Network
 
 __all__ = ["Format", "formats", "read", "recognise", "write"]
@@ -25,18 +25,28 @@ def recognise(path: Path) -> Format:
     Raises
     ------
     InputError
-        If the path does not exist, or no format or several know it.
+        If the path does not exist, cannot be read, or no format or several know it.
     """
-    if not path.exists():
-        raise InputError("no such file or folder", path)
-    if path.is_file() and path.stat().st_size == 0:
-        raise InputError("the file is empty", path)
-    found = [f for f in formats().values() if f.recognises(path)]
+    try:
+        _exists(path)
+        if path.is_file() and path.stat().st_size == 0:
+            raise InputError("the file is empty", path)
+        found = [f for f in formats().values() if f.recognises(path)]
+    except OSError as error:
+        raise unreadable(error, path) from None
     if not found:
         raise InputError(f"no known format recognises it; known are {', '.join(formats())} (choose with --format)", path)
     if len(found) > 1:
         raise InputError(f"several formats recognise it ({', '.join(f.name for f in found)}); choose with --format", path)
     return found[0]
+
+
+def _exists(path: Path) -> None:
+    """Refuse what is neither a folder nor a regular file: opening a pipe or a device might never end."""
+    if not path.exists():
+        raise InputError("no such file or folder", path)
+    if not path.is_dir():
+        regular_size(path)
 
 
 def read(path: str | Path, format: str | None = None, control: str | Path | None = None) -> Network:
@@ -65,11 +75,14 @@ def read(path: str | Path, format: str | None = None, control: str | Path | None
         chosen = recognise(where)
     elif format in formats():
         chosen = formats()[format]
-        if not where.exists():
-            raise InputError("no such file or folder", where)
     else:
         raise UsageError(f"unknown format {format!r}; known are {', '.join(formats())}")
-    network = replace(chosen.read(where), path=str(path), format=chosen.name, sha256=digest(where))
+    try:
+        _exists(where)
+        network = chosen.read(where)
+    except OSError as error:
+        raise unreadable(error, where) from None
+    network = replace(network, path=str(path), format=chosen.name, sha256=digest(where))
     if control is not None:
         from baarda.formats.control import with_control
 
@@ -78,7 +91,21 @@ def read(path: str | Path, format: str | None = None, control: str | Path | None
 
 
 def digest(path: Path) -> str:
-    """Return the sha256 of a file, or over the sorted relative names, sizes and contents of a folder."""
+    """Return the sha256 of a file, or over the sorted relative names, sizes and contents of a folder.
+
+    Raises
+    ------
+    InputError
+        If the path is neither a folder nor a regular file, or something cannot be read.
+    """
+    try:
+        _exists(path)
+        return _digest(path)
+    except OSError as error:
+        raise unreadable(error, path) from None
+
+
+def _digest(path: Path) -> str:
     total = hashlib.sha256()
     if path.is_file():
         with path.open("rb") as f:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+import stat
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +15,99 @@ from baarda.errors import InputError
 from baarda.network import Network
 
 LARGEST = 4 * 1024**3  # bytes of a text file that a reader accepts
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
+_CONTROL_BUT_TAB = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
+
+
+def number(text: str) -> float:
+    """Return a number in ASCII digits; `float` alone would also take 1_000 and the digits of other scripts.
+
+    Raises
+    ------
+    ValueError
+        If the text is not a number.
+
+    Examples
+    --------
+    >>> number("1e3"), number(" -.5")
+    (1000.0, -0.5)
+    """
+    if "_" in text or not text.isascii():
+        raise ValueError(f"not a number: {text!r}")
+    return float(text)
+
+
+def whole_number(text: str) -> int:
+    """Return a whole number in at most 18 ASCII digits, with or without a sign.
+
+    Raises
+    ------
+    ValueError
+        If the text is not such a number.
+    """
+    if not re.fullmatch(r"[+-]?\d{1,18}", text, re.ASCII):
+        raise ValueError(f"not a whole number: {text!r}")
+    return int(text)
+
+
+def control_character(text: str) -> str | None:
+    r"""Return the first control character (code below 32, or 127) of a label, None when there is none.
+
+    Examples
+    --------
+    >>> control_character("Tür 12"), control_character("a\tb")
+    (None, '\t')
+    """
+    found = _CONTROL.search(text)
+    return found[0] if found else None
+
+
+def label_problem(label: str, what: str) -> str | None:
+    """Return why a label cannot be used, None when it can: it must not hold control characters."""
+    found = control_character(label)
+    return None if found is None else f"{what} {label!r} holds a control character ({found!r})"
+
+
+def regular_size(path: Path) -> int:
+    """Return the size of a file in bytes.
+
+    Raises
+    ------
+    InputError
+        If it is missing, cannot be looked at, or is not a regular file (a folder, a pipe, a device).
+    """
+    try:
+        found = path.stat()
+    except (FileNotFoundError, ValueError):  # ValueError: a name with a zero byte
+        raise InputError("no such file", path) from None
+    except OSError as error:
+        raise unreadable(error, path) from None
+    if not stat.S_ISREG(found.st_mode):
+        raise InputError("not a regular file", path)
+    return found.st_size
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return the content of a regular file.
+
+    Raises
+    ------
+    InputError
+        If it is missing, not a regular file, too large, or cannot be read.
+    """
+    size = regular_size(path)
+    if size > LARGEST:
+        raise InputError(f"the file has {size} bytes; the limit is {LARGEST}", path)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise unreadable(error, path) from None
+
+
+def unreadable(error: OSError, path: Path) -> InputError:
+    """Return the error of a file or folder that the system does not let us read."""
+    name = error.filename if isinstance(error.filename, str) else path
+    return InputError(f"cannot be read: {error.strerror or error}", name)
 
 
 @dataclass(frozen=True)
@@ -51,11 +146,15 @@ class Line:
         """Return an error that names file and line."""
         return InputError(message, self.file, self.number)
 
+    def complain(self, _row: int, message: str) -> InputError:
+        """Return an error that names file and line, for checks that also name a row."""
+        return self.error(message)
+
     def number_at(self, i: int, what: str) -> float:
         """Return field i as a finite number, or fail with its name."""
         text = self.text_at(i, what)
         try:
-            value = float(text)
+            value = number(text)
         except ValueError:
             raise self.error(f"{what} is not a number: {text!r}") from None
         if not math.isfinite(value):
@@ -66,7 +165,7 @@ class Line:
         """Return field i as an integer, or fail with its name."""
         text = self.text_at(i, what)
         try:
-            return int(text)
+            return whole_number(text)
         except ValueError:
             raise self.error(f"{what} is not an integer: {text!r}") from None
 
@@ -74,6 +173,9 @@ class Line:
         """Return field i, or fail with its name when the line is too short or the field empty."""
         if i >= len(self.fields) or not self.fields[i]:
             raise self.error(f"{what} is missing (the line has {len(self.fields)} fields)")
+        problem = label_problem(self.fields[i], what)
+        if problem:
+            raise self.error(problem)
         return self.fields[i]
 
 
@@ -83,17 +185,9 @@ def read_text(path: Path) -> str:
     Raises
     ------
     InputError
-        If it is missing, empty, too large, or not UTF-8 text.
+        If it is missing, not a regular file, empty, too large, or not UTF-8 text.
     """
-    try:
-        size = path.stat().st_size
-        if size > LARGEST:
-            raise InputError(f"the file has {size} bytes; the limit is {LARGEST}", path)
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError("no such file", path) from None
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", path) from None
+    data = read_bytes(path)
     if not data.strip():
         raise InputError("the file is empty", path)
     try:
@@ -101,6 +195,25 @@ def read_text(path: Path) -> str:
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
         raise InputError("the file is not UTF-8 text", path, line) from None
+
+
+def split_lines(path: Path) -> list[str]:
+    """Return the lines of a text file as editors count them; a control character in one is an error.
+
+    Raises
+    ------
+    InputError
+        See `read_text`.
+    """
+    # not splitlines(), which also splits at separators of Unicode that a label may hold
+    lines = read_text(path).replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    if not lines[-1]:
+        lines.pop()
+    for i, line in enumerate(lines, start=1):
+        found = _CONTROL_BUT_TAB.search(line)
+        if found:
+            raise InputError(f"the line holds a control character ({found[0]!r})", path, i)
+    return lines
 
 
 def read_lines(path: Path, separator: str | None = ",", comment: str = "#") -> Iterator[Line]:
@@ -119,11 +232,11 @@ def read_lines(path: Path, separator: str | None = ",", comment: str = "#") -> I
     InputError
         See `read_text`.
     """
-    for number, text in enumerate(read_text(path).splitlines(), start=1):
+    for i, text in enumerate(split_lines(path), start=1):
         stripped = text.strip()
         if stripped and not stripped.startswith(comment):
             fields = stripped.split(separator)
-            yield Line(path, number, tuple(f.strip() for f in fields))
+            yield Line(path, i, tuple(f.strip() for f in fields))
 
 
 def unique(labels: Sequence[str], lines: Sequence[Line], what: str) -> dict[str, int]:

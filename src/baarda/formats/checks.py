@@ -49,6 +49,40 @@ def measured_once(images: Ints, points: Ints, labels: Sequence[str], error: Comp
         raise error(second, f"point {labels[points[second]]!r} is measured twice in this image (first in line {line(first)})")
 
 
+#: smallest and largest standard deviation that a reader accepts: squares and weights beyond them lose all digits
+SIGMAS = (1e-12, 1e12)
+
+
+def sigma_range(values: Sequence[float] | Floats, what: str, error: Complaint, smallest: float = SIGMAS[0]) -> None:
+    """Refuse standard deviations that no measurement has; 0 (exact) and NaN (missing) are left to the caller.
+
+    Parameters
+    ----------
+    values : (n,) or (n, k) array
+        Standard deviations, not negative.
+    what : str
+        Name for the message.
+    error : callable
+        Row to error.
+    smallest : float
+        Least positive one; coefficients of distortion have far smaller ones than coordinates.
+
+    Raises
+    ------
+    InputError
+        That names the value.
+
+    Examples
+    --------
+    >>> sigma_range([0.0, 0.5], "sigma_x", lambda row, message: InputError(message))
+    """
+    rows = np.asarray(values, dtype=float).reshape(len(values), -1)
+    bad = np.argwhere((rows != 0.0) & ~np.isnan(rows) & ~((rows >= smallest) & (rows <= SIGMAS[1])))
+    if len(bad):
+        row, column = bad[0]
+        raise error(int(row), f"{what} = {float(rows[row, column])!r} does not lie between {smallest:g} and {SIGMAS[1]:g}")
+
+
 def images_with_points(images: Ints, labels: Sequence[str], needed: NDArray[np.bool_], error: Complaint) -> None:
     """Refuse images without image points.
 
@@ -137,7 +171,8 @@ def control_unit(points: Points, unit: str, error: Complaint, position: Floats |
     """Refuse control whose size contradicts the start values by a factor that only a wrong unit explains.
 
     Compared are the control and check points with their own start values (limit 50); where these tell nothing, with the start values of
-    the other points (limit 200), where there are none, with the distances of the cameras (limit 200).
+    the other points (limit 200), where there are none, with the distances of the
+    cameras (limit 50).
 
     Parameters
     ----------
@@ -169,14 +204,24 @@ def control_unit(points: Points, unit: str, error: Complaint, position: Floats |
             raise error(int(known[0]), _wrong_unit(size, _size(ties), "start values of the other points", unit))
     elif position is not None:
         position = position[np.isfinite(position).all(axis=1)]
-        if len(position) and size > 0.0:
-            away = float(np.median(_lengths(position - np.median(control, axis=0))))
-            if away > 0.0 and not 1 / 200 < size / away < 200:
-                raise error(int(known[0]), _wrong_unit(size, away, "start values of the cameras, away from the control,", unit))
+        away = _lengths(position - np.median(control, axis=0))
+        whose = "start values of the cameras, away from the control,"
+        # what spreads far beyond all cameras is judged by a size that gross errors do not change; what looks too small must do so from
+        # the camera next to it: the control may stand in one corner of a large block
+        if len(away) and np.median(away) > 0.0 and size > 50.0 * np.median(away):
+            raise error(int(known[0]), _wrong_unit(size, float(np.median(away)), whose, unit, 1e3))
+        # a wrong unit carries the control away from the cameras, too: several cameras that all huddle at the origin of such control
+        reach = float(_lengths(position).max(initial=0.0))
+        if len(np.unique(position, axis=0)) > 2 and size > 100.0 * reach:
+            raise error(int(known[0]), _wrong_unit(size, reach, "start values of the cameras", unit, 1e3))
+        half = float(_lengths(control - 0.5 * (control.min(axis=0) + control.max(axis=0))).max())
+        if len(away) and half > 0.0 and 50.0 * half < away.min():
+            raise error(int(known[0]), _wrong_unit(half, float(away.min()), whose, unit, 1e-3))
 
 
-def _wrong_unit(size: float, other: float, whose: str, unit: str) -> str:
-    guess = guessed_unit(unit, size / other)
+def _wrong_unit(size: float, other: float, whose: str, unit: str, factor: float | None = None) -> str:
+    """Return the message; the factor between the units follows from the sizes unless it is said."""
+    guess = guessed_unit(unit, size / other if factor is None else factor)
     hint = f"; are the control coordinates in {guess} and not in {unit}?" if guess else "; check the unit of the control coordinates"
     return f"the control and check points spread over {size:.4g}, the {whose} over {other:.4g}: not the same unit{hint}"
 

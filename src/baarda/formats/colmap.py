@@ -20,7 +20,7 @@ from baarda import cameras as camera_models
 from baarda.cameras import Camera
 from baarda.errors import InputError
 from baarda.formats import checks
-from baarda.formats.base import Format, read_text
+from baarda.formats.base import Format, label_problem, number, read_text
 from baarda.formats.colmap_binary import read_cameras_binary, read_images_binary, read_points_binary, read_rigs_binary
 from baarda.formats.colmap_model import CAMERA_MODELS, NO_POINT, ModelCamera, ModelImage, ModelPoints, Place
 from baarda.formats.colmap_writer import write
@@ -30,6 +30,7 @@ from baarda.observations import ImagePoints
 Floats = NDArray[np.float64]
 
 PARTS = ("cameras", "images", "points3D")
+LARGEST_PARAMETER = 1e12  # of a camera; no lens has more, and its square must not overflow
 AXES = np.diag([1.0, -1.0, -1.0])  # COLMAP's camera axes in ours
 
 
@@ -122,13 +123,9 @@ def _records(lines: Sequence[str]) -> Iterator[tuple[int, str]]:
 
 def _numbers(fields: Sequence[str], place: Place, what: str) -> Floats:
     try:
-        if any("_" in f for f in fields):
-            raise ValueError
-        values = np.array([float(f) for f in fields])
+        values = np.array([number(f) for f in fields])
     except ValueError:
-        bad = next(
-            f for f in fields if not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", f, re.IGNORECASE)
-        )
+        bad = next(f for f in fields if not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", f, re.I | re.A))
         raise place.error(f"{what}: not a number: {bad!r}") from None
     if not np.isfinite(values).all():
         raise place.error(f"{what}: not finite: {fields[int(np.flatnonzero(~np.isfinite(values))[0])]!r}")
@@ -136,7 +133,7 @@ def _numbers(fields: Sequence[str], place: Place, what: str) -> Floats:
 
 
 def _integer(text: str, place: Place, what: str) -> int:
-    if not re.fullmatch(r"\d{1,18}", text):
+    if not re.fullmatch(r"\d{1,18}", text, re.ASCII):
         raise place.error(f"{what} is not a whole number: {text!r}")
     return int(text)
 
@@ -155,8 +152,8 @@ def _last(lines: Sequence[str]) -> int:
 def _read_cameras(path: Path) -> list[ModelCamera]:
     lines, announced = _lines(path, "cameras")
     out = []
-    for number, line in _records(lines):
-        place, fields = Place(path, line=number), line.split()
+    for at, line in _records(lines):
+        place, fields = Place(path, line=at), line.split()
         if len(fields) < 5:
             raise place.error(f"a camera needs id, model, width, height and parameters; the line has {len(fields)} fields")
         out.append(
@@ -201,11 +198,11 @@ def _points2d(fields: list[str], place: Place) -> tuple[Floats, NDArray[np.int64
         raise place.error(f"image points are x, y, point id; the line has {len(fields)} fields, not a multiple of 3: truncated?")
     x, y = _numbers(fields[0::3], place, "x of an image point"), _numbers(fields[1::3], place, "y of an image point")
     try:
-        if "_" in "".join(fields[2::3]):  # int() takes 1_000
+        if "_" in (all_ids := "".join(fields[2::3])) or not all_ids.isascii():  # int() takes 1_000
             raise ValueError
         ids = np.array([NO_POINT if t == "18446744073709551615" else int(t) for t in fields[2::3]], dtype=np.int64)
     except (ValueError, OverflowError):
-        bad = next(t for t in fields[2::3] if not re.fullmatch(r"-1|\d{1,18}|18446744073709551615", t))
+        bad = next(t for t in fields[2::3] if not re.fullmatch(r"-1|\d{1,18}|18446744073709551615", t, re.ASCII))
         raise place.error(f"not the id of a point: {bad!r}") from None
     return np.stack([x, y], axis=1), ids
 
@@ -213,34 +210,34 @@ def _points2d(fields: list[str], place: Place) -> tuple[Floats, NDArray[np.int64
 def _read_points(path: Path) -> ModelPoints:
     lines, announced = _lines(path, "points")
     ids, fields_of_xyz, tracks, numbers = [], [], [], []
-    for number, line in _records(lines):
+    for at, line in _records(lines):
         fields = line.split()
         if len(fields) < 8 or len(fields) % 2:
-            place = Place(path, line=number)
+            place = Place(path, line=at)
             raise place.error(f"a point needs id, X Y Z, three colours, error and pairs of its track; the line has {len(fields)} fields")
-        ids.append(_integer(fields[0], Place(path, line=number), "point id"))
+        ids.append(_integer(fields[0], Place(path, line=at), "point id"))
         fields_of_xyz.append(fields[1:4])
         tracks.append((len(fields) - 8) // 2)
-        numbers.append(number)
+        numbers.append(at)
     _complete(len(ids), announced, path, lines, "points")
     try:
-        xyz = np.array([[float(t) for t in f] for f in fields_of_xyz]).reshape(-1, 3)
-        good = bool(np.isfinite(xyz).all()) and not any("_" in t for f in fields_of_xyz for t in f)
+        xyz = np.array([[number(t) for t in f] for f in fields_of_xyz]).reshape(-1, 3)
+        good = bool(np.isfinite(xyz).all())
     except ValueError:
         good = False
     if not good:
-        for number, f in zip(numbers, fields_of_xyz, strict=True):
-            _numbers(f, Place(path, line=number), "coordinates")
+        for at, f in zip(numbers, fields_of_xyz, strict=True):
+            _numbers(f, Place(path, line=at), "coordinates")
     return ModelPoints(path, np.array(ids, dtype=np.int64), xyz, np.array(tracks, dtype=np.int64), np.array(numbers, dtype=np.int64))
 
 
 def _read_rigs(path: Path) -> list[int]:
     out = []
-    for number, line in _records(_lines(path, "rigs")[0]):
+    for at, line in _records(_lines(path, "rigs")[0]):
         fields = line.split()
         if len(fields) < 2:
-            raise InputError("a rig needs id and number of sensors", path, number)
-        out.append(_integer(fields[1], Place(path, line=number), "number of sensors"))
+            raise InputError("a rig needs id and number of sensors", path, at)
+        out.append(_integer(fields[1], Place(path, line=at), "number of sensors"))
     return out
 
 
@@ -261,6 +258,9 @@ def _network(
         raise second.error(f"point {ids[twice[0]]} appears twice (first {first})")
     names: dict[str, ModelImage] = {}
     for image in images:
+        problem = label_problem(image.name, "image name")
+        if problem:
+            raise image.place.error(problem)
         if image.name in names:
             raise image.place.error(f"image {image.name!r} appears twice (first {names[image.name].place})")
         names[image.name] = image
@@ -287,8 +287,8 @@ def _network(
     differ = int((np.bincount(observed.points, minlength=len(ids)) != points.tracks[order]).sum())
     if differ and unfinished:
         file = unfinished[0]
-        number = file.read_bytes().count(b"\n") + 1
-        raise InputError("the line has no end, and the tracks of points3D and the image points disagree: truncated?", file, number)
+        last = file.read_bytes().count(b"\n") + 1
+        raise InputError("the line has no end, and the tracks of points3D and the image points disagree: truncated?", file, last)
     _say(notes, observed, dropped, differ)
     rotation = np.stack([_rotation(i) for i in images])
     position = -np.einsum("nji,nj->ni", rotation, np.stack([i.translation for i in images]))
@@ -352,6 +352,8 @@ def _camera(camera: ModelCamera) -> Camera:
         )
     values = dict(zip(order, camera.parameters.tolist(), strict=True))
     for name, value in values.items():
+        if not abs(value) <= LARGEST_PARAMETER:
+            raise camera.place.error(f"camera {camera.id}: {name} = {value!r} is not finite or beyond {LARGEST_PARAMETER:g}")
         if name.startswith("principal_distance") and not value > 0.0:
             raise camera.place.error(f"camera {camera.id}: the principal distance must be positive, not {value!r}")
     if camera.width < 1 or camera.height < 1:

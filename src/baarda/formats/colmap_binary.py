@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from baarda import cameras as camera_models
 from baarda.errors import InputError
-from baarda.formats.base import LARGEST
+from baarda.formats.base import read_bytes
 from baarda.formats.colmap_model import CAMERA_MODELS, NO_POINT, ModelCamera, ModelImage, ModelPoints, Place
 
 _POINT2D = np.dtype([("xy", "<f8", 2), ("id", "<u8")])
@@ -21,13 +21,7 @@ class _Cursor:
     """The bytes of a file and how far they are read."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            size = path.stat().st_size
-            if size > LARGEST:
-                raise InputError(f"the file has {size} bytes; the limit is {LARGEST}", path)
-            self.data = path.read_bytes()
-        except OSError as error:
-            raise InputError(f"cannot be read: {error.strerror}", path) from None
+        self.data = read_bytes(path)
         if not self.data:
             raise InputError("the file is empty", path)
         self.path, self.at = path, 0

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baarda.errors import InputError, UsageError
-from baarda.formats.base import read_text
+from baarda.formats.base import label_problem, number, read_text
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -91,8 +91,8 @@ class CsvTable:
         except ValueError:
             row = next(i for i, t in enumerate(column) if t and not _is_number(t))
             raise self.error(row, f"{name} is not a number: {column[row]!r}") from None
-        if "_" in "".join(column):  # float() takes 1_000
-            row = next(i for i, t in enumerate(column) if "_" in t)
+        if "_" in (everything := "".join(column)) or not everything.isascii():  # float() takes 1_000 and the digits of other scripts
+            row = next(i for i, t in enumerate(column) if t and not _is_number(t))
             raise self.error(row, f"{name} is not a number: {column[row]!r}")
         for row in np.flatnonzero(~np.isfinite(values)).tolist():
             if column[row]:
@@ -119,8 +119,14 @@ class CsvTable:
             raise self.error(row, f"unknown {what} {column[row]!r}") from None
 
     def labels(self, name: str, what: str) -> dict[str, int]:
-        """Return the row of each label; a label that appears twice is an error that names both lines."""
+        """Return the row of each label; a label that appears twice is an error that names both lines.
+
+        Control characters in a label are an error, too.
+        """
         column = self.texts(name)
+        for i, problem in enumerate(label_problem(t, what) for t in column):
+            if problem:
+                raise self.error(i, problem)
         out = {t: i for i, t in enumerate(column)}
         if len(out) < len(column):
             first: dict[str, int] = {}
@@ -133,7 +139,7 @@ class CsvTable:
 
 def _is_number(text: str) -> bool:
     try:
-        float(text)
+        number(text)
     except ValueError:
         return False
     return True

@@ -17,7 +17,8 @@ import numpy as np
 from baarda import cameras
 from baarda.cameras import FIXED, FREE, OBSERVED, Camera
 from baarda.errors import InputError
-from baarda.formats.base import Format, Line, read_lines, read_text, unique
+from baarda.formats.base import Format, Line, number, read_lines, read_text, unique, whole_number
+from baarda.formats.checks import sigma_range
 from baarda.network import CHECK, CONTROL, TIE, Images, Network, Points
 from baarda.observations import ImagePoints
 
@@ -35,6 +36,8 @@ _INTERIOR = {
     "P": ("P1", "P2"),
     **{name: (name,) for name in ("K1", "K2", "K3", "P1", "P2")},
 }
+_OPERATIONS = ("check_ray_count", "spatial_resection", "forward_intersection", "bundle_adjustment")
+_SETTINGS = ("set_initial_values", "set_bundle_estimate_params")
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,12 @@ def read(path: Path) -> Network:
         if child.tag not in known:
             raise InputError(f"element <{child.tag}> of <input> is not known", path)
     operations = root.find("operations")
-    camera, notes = _camera(_find(_find(source, "cameras", path), "camera", path), operations, path)
+    min_rays = _operations(operations, path)
+    described = _find(source, "cameras", path)
+    count = len(described.findall("camera"))
+    if count > 1:
+        raise InputError(f"<cameras> has {count} cameras; only one is supported, because images do not say which one they belong to", path)
+    camera, notes = _camera(_find(described, "camera", path), operations, path)
     images, image_index = _images(source, base, path)
     control = _coordinates(source.find("ctrl_pts"), base, path)
     check = _coordinates(source.find("check_pts"), base, path)
@@ -96,10 +104,7 @@ def read(path: Path) -> Network:
     for label, line in zip(images.labels, image_index.values(), strict=True):
         if not seen[image_index_of(images, label)]:
             raise line.error(f"image {label!r} has no image points")
-    settings: dict[str, Any] = {"datum": "control", "min_rays": 0}
-    for op in [] if operations is None else operations.findall("operation"):
-        if (op.text or "").strip() == "check_ray_count":
-            settings["min_rays"] = int(op.get("min_rays", "2"))
+    settings: dict[str, Any] = {"datum": "control", "min_rays": min_rays}
     _exterior_flags(operations, path)
     name = (root.findtext("meta/name") or path.stem).strip()
     unit = (root.findtext("meta/project_unit") or "m").strip()
@@ -128,12 +133,66 @@ def _expand(folder: str, path: Path) -> Path:
 
 def _numbers(text: str | None, what: str, path: Path, count: int | None = None) -> list[float]:
     try:
-        out = [float(t) for t in (text or "").split(",") if t.strip()]
+        out = [number(t) for t in (text or "").split(",") if t.strip()]
     except ValueError:
         raise InputError(f"<{what}> is not a list of numbers: {text!r}", path) from None
     if (count is not None and len(out) != count) or not np.isfinite(out).all():
         raise InputError(f"<{what}> needs {count} finite number(s), not {text!r}", path)
     return out
+
+
+def _whole(text: str, what: str, path: Path, allowed: range) -> int:
+    try:
+        value = whole_number(text.strip())
+    except ValueError:
+        raise InputError(f"{what} is not a whole number: {text!r}", path) from None
+    if value not in allowed:
+        raise InputError(f"{what} must be {_listed(allowed)}, not {value}", path)
+    return value
+
+
+def _listed(allowed: range) -> str:
+    return ", ".join(map(str, allowed)) if len(allowed) < 10 else f"between {allowed[0]} and {allowed[-1]}"
+
+
+def _operations(operations: ElementTree.Element | None, path: Path) -> int:
+    """Check that all operations are known; return the least number of rays that the script asks for."""
+    min_rays = 0
+    seen: set[str] = set()
+    for op in [] if operations is None else operations:
+        if op.tag == "c":
+            continue
+        if op.tag != "operation":
+            raise InputError(f"element <{op.tag}> of <operations> is not known", path)
+        children = [child.tag for child in op if child.tag != "c"]
+        text = (op.text or "").strip()
+        if text not in (*_OPERATIONS, *([""] if children else [])):
+            raise InputError(f"operation {text!r} is not known; known are {', '.join((*_OPERATIONS, *_SETTINGS))}", path)
+        for tag in children:
+            if tag not in _SETTINGS:
+                raise InputError(f"operation <{tag}> is not known; known are {', '.join((*_OPERATIONS, *_SETTINGS))}", path)
+            if tag in seen:
+                raise InputError(f"operation <{tag}> appears twice", path)
+            seen.add(tag)
+        if text == "check_ray_count":
+            min_rays = _whole(op.get("min_rays", "2"), "min_rays", path, range(1001))
+    initial = None if operations is None else operations.find("./operation/set_initial_values")
+    for child in [] if initial is None else initial:
+        if child.tag not in ("c", "io", "eo", "op"):
+            raise InputError(f"<set_initial_values>: element <{child.tag}> is not known", path)
+        if child.tag != "c":
+            _initial(child, path)
+    return min_rays
+
+
+def _initial(element: ElementTree.Element, path: Path) -> str:
+    """Return where initial values come from: default or loaded."""
+    others = [child.tag for child in element if child.tag not in ("c", "all")]
+    word = (element.text or "").strip() or (element.findtext("all") or "").strip()
+    if others or word not in ("default", "loaded"):
+        wrong = f"<{others[0]}>" if others else repr(word)
+        raise InputError(f"<set_initial_values><{element.tag}>: {wrong} is not known; known are default, loaded for all values", path)
+    return word
 
 
 def _camera(element: ElementTree.Element, operations: ElementTree.Element | None, path: Path) -> tuple[Camera, list[str]]:
@@ -154,10 +213,17 @@ def _camera(element: ElementTree.Element, operations: ElementTree.Element | None
     if min(*size, height, width) <= 0:
         raise InputError("<image> and <sensor> must be positive", path)
     pixel = np.array([width / size[0], height / size[1]])
-    coefficients, decentring = int(text("nK") or 3), int(text("nP") or 2)
+    coefficients = _whole(text("nK") or "3", "<nK>", path, range(4))
+    decentring = _whole(text("nP") or "2", "<nP>", path, range(0, 3, 2))
+    if (text("unit") or "mm") != "mm":
+        raise InputError(f"the <unit> of a camera must be mm, not {text('unit')!r}", path)
+    for tag, most in (("K", 3), ("P", 2)):
+        if len(_numbers(text(tag), tag, path)) > most:
+            raise InputError(f"<{tag}> has more than {most} values: {text(tag)!r}", path)
+    skew = _numbers(text("skew") or "0", "skew", path, 1)[0]
 
     io = None if operations is None else operations.find(".//set_initial_values/io")
-    how = "loaded" if io is None else ((io.text or "").strip() or (io.findtext("all") or "").strip())
+    how = "loaded" if io is None else _initial(io, path)
     values: dict[str, float] = {"principal_distance": 0.0, "principal_point_x": width / 2, "principal_point_y": height / 2}
     focal = text("cc") if how == "loaded" and text("cc") else text("focal") or text("cc")
     values["principal_distance"] = _numbers(focal, "focal", path, 1)[0]
@@ -170,8 +236,8 @@ def _camera(element: ElementTree.Element, operations: ElementTree.Element | None
         for tag in ("K", "P"):
             for k, v in enumerate(_numbers(text(tag), tag, path), start=1):
                 values[f"{tag}{k}"] = v
-        if float(text("skew") or 0) and "B2" in model.order:
-            values["B2"] = float(text("skew"))
+        if skew and "B2" in model.order:
+            values["B2"] = skew
     else:
         notes.append(
             "interior orientation starts from its defaults: nominal focal length, principal point at the sensor's centre, no distortion"
@@ -180,7 +246,7 @@ def _camera(element: ElementTree.Element, operations: ElementTree.Element | None
     unused = {f"K{k}" for k in range(coefficients + 1, 4)} | ({"P1", "P2"} if decentring < 2 else set())
     free = [n for n in model.order if n in wanted and n not in unused]
     label = text("id") or "1"
-    constants: dict[str, Any] = {"unit": text("unit") or "mm", "pixel_size": pixel, "image_size": (size[0], size[1])}
+    constants: dict[str, Any] = {"unit": "mm", "pixel_size": pixel, "image_size": (size[0], size[1])}
     return cameras.create(label, model, {k: v for k, v in values.items() if k in model.order}, free=free, **constants), notes
 
 
@@ -220,18 +286,25 @@ def _files(element: ElementTree.Element | None, base: Path) -> list[tuple[Elemen
     return [(f, base / (f.text or "").strip().replace("\\", "/")) for f in element.findall("file")]
 
 
-def _columns(element: ElementTree.Element, path: Path, known: set[str]) -> list[str]:
+def _columns(element: ElementTree.Element, path: Path, known: set[str], required: tuple[str, ...]) -> list[str]:
+    """Return the names of the columns that a `format` lists; only `ignored` may stand there more than once."""
     columns = [c.strip() for c in element.get("format", "").split(",")]
     bad = [c for c in columns if c not in known]
     if bad:
         raise InputError(f"column {bad[0]!r} in format={element.get('format')!r} is not known; known are {', '.join(sorted(known))}", path)
+    twice = [c for c in columns if c != "ignored" and columns.count(c) > 1]
+    if twice:
+        raise InputError(f"column {twice[0]!r} appears twice in format={element.get('format')!r}", path)
+    missing = [c for c in required if c not in columns]
+    if missing:
+        raise InputError(f"column {missing[0]!r} is missing in format={element.get('format')!r}", path)
     return columns
 
 
 def _images(source: ElementTree.Element, base: Path, path: Path) -> tuple[Images, dict[str, Line]]:
     labels, lines = [], []
     for element, file in _files(_find(source, "images", path), base):
-        columns = _columns(element, path, {"id", "path", "label", "ignored"})
+        columns = _columns(element, path, {"id", "path", "label", "ignored"}, ("id", "path"))
         for line in read_lines(file):
             labels.append(line.text_at(columns.index("id"), "image id"))
             lines.append(line)
@@ -246,7 +319,7 @@ def _coordinates(element: ElementTree.Element | None, base: Path, path: Path) ->
     out = []
     names = {"id", "label", "x", "y", "z", "sx", "sy", "sz", "sxy", "sxyz", "ignored"}
     for node, file in _files(element, base):
-        columns = _columns(node, path, names)
+        columns = _columns(node, path, names, ("id", "x", "y", "z"))
         for line in read_lines(file):
             if len(line.fields) != len(columns):
                 raise line.error(f"{len(line.fields)} fields where the format {node.get('format')!r} has {len(columns)}")
@@ -258,6 +331,7 @@ def _coordinates(element: ElementTree.Element | None, base: Path, path: Path) ->
                 sigmas.append(0.0 if choice is None else line.number_at(at[choice], choice))
             if min(sigmas) < 0:
                 raise line.error(f"a standard deviation is negative: {min(sigmas)}")
+            sigma_range(sigmas, "a standard deviation", line.complain)
             out.append(_Given(line, line.text_at(at["id"], "point id"), xyz, sigmas))
     unique([g.label for g in out], [g.line for g in out], "point")
     for node in [] if element is None else element.findall("filter"):
@@ -265,6 +339,8 @@ def _coordinates(element: ElementTree.Element | None, base: Path, path: Path) ->
         missing = ids - {g.label for g in out}
         if missing:
             raise InputError(f"the filter names points that the table does not have: {', '.join(sorted(missing))}", path)
+        if (node.text or "").strip() not in ("keep", "remove"):
+            raise InputError(f"a filter must say keep or remove, not {node.text!r}", path)
         keep = (node.text or "").strip() == "keep"
         out = [g for g in out if (g.label in ids) == keep]
     return out
@@ -278,9 +354,11 @@ def _image_points(
     rows: list[tuple[int, int, float, float, float, float]] = []
     first: dict[tuple[int, int], Line] = {}
     for element, file in _files(_find(source, "image_pts", path), base):
-        columns = _columns(element, path, {"id", "im", "x", "y", "sx", "sy", "sxy", "ignored"})
+        columns = _columns(element, path, {"id", "im", "x", "y", "sx", "sy", "sxy", "ignored"}, ("id", "im", "x", "y"))
         default = _numbers(element.get("sxy"), "sxy", path, 1)[0] if element.get("sxy") else None
         at = {c: i for i, c in enumerate(columns)}
+        if default is None and "sxy" not in at and not {"sx", "sy"} <= at.keys():
+            raise InputError(f"column 'sxy' (or 'sx' and 'sy') is missing in format={element.get('format')!r}", path)
         for line in read_lines(file):
             if len(line.fields) != len(columns):
                 raise line.error(f"{len(line.fields)} fields where the format {element.get('format')!r} has {len(columns)}")
@@ -294,6 +372,7 @@ def _image_points(
             sigma = [default if default is not None else line.number_at(at[c if c in at else "sxy"], c) for c in ("sx", "sy")]
             if min(sigma) <= 0:
                 raise line.error(f"a standard deviation must be positive, not {min(sigma)}")
+            sigma_range(sigma, "a standard deviation", line.complain)
             rows.append((*key, line.number_at(at["x"], "x"), line.number_at(at["y"], "y"), sigma[0], sigma[1]))
     if not rows:
         raise InputError("the script names no image points", path)

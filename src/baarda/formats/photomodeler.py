@@ -14,8 +14,8 @@ import numpy as np
 
 from baarda import cameras
 from baarda.errors import InputError
-from baarda.formats.base import Format, Line, read_text
-from baarda.formats.checks import MODEL_UNITS
+from baarda.formats.base import Format, Line, split_lines
+from baarda.formats.checks import MODEL_UNITS, sigma_range
 from baarda.geometry import rotation as rot
 from baarda.network import Images, Network, Points
 from baarda.observations import ImagePoints
@@ -44,18 +44,27 @@ def read(path: Path) -> Network:
     InputError
         With file and line where the file cannot be used.
     """
-    lines = [Line(path, i, tuple(t.split())) for i, t in enumerate(read_text(path).splitlines(), start=1)]
+    texts = split_lines(path)
+    if texts[-1] and not texts[-1].strip():  # the indent of a line that was cut, not a blank line
+        texts.pop()
+    lines = [Line(path, i, tuple(t.split())) for i, t in enumerate(texts, start=1)]
     if len(lines) < 6:
         raise InputError("the file ends before the first photograph", path, len(lines))
     if len(lines[1].fields) < 4:
         raise lines[1].error("the image size in pixels is missing (fields 3 and 4)")
     size = (lines[1].number_at(2, "image width"), lines[1].number_at(3, "image height"))
+    if min(size) <= 0:
+        raise lines[1].error(f"the image size in pixels must be positive, not {size[0]:g} x {size[1]:g}")
     default = [lines[3].number_at(i, "camera value") for i in range(10)]
+    if default[0] <= 0:
+        raise lines[3].error(f"the principal distance must be positive, not {default[0]!r}")
+    if min(default[3:5]) <= 0:
+        raise lines[3].error(f"the format size must be positive, not {default[3]!r} x {default[4]!r}")
     cursor = iter(lines[5:])
     labels, names, exterior = _photographs(cursor)
     _section(cursor, 7)  # control points as adjusted: not what was given
     objects = _section(cursor, 7)
-    marks = _section(cursor, 6)
+    marks = _section(cursor, 6, ends=True)
     if not marks:
         raise InputError("the export has no marked points", path)
     points: dict[str, int] = {}
@@ -69,13 +78,18 @@ def read(path: Path) -> Network:
     default_sigma = lines[2].number_at(0, "default standard deviation of marks")
     place = {label: i for i, label in enumerate(labels)}
     rows, without, defaulted = [], 0, 0
+    first: dict[tuple[str, str], Line] = {}
     for line in marks:
         image, point = line.text_at(0, "photo id"), line.text_at(1, "point id")
         if image not in place:
             raise line.error(f"photo {image!r} is not in the list of photographs")
+        if (image, point) in first:
+            raise line.error(f"point {point!r} is measured twice in photo {image!r} (first in line {first[image, point].number})")
+        first[image, point] = line
         x, y, *sigmas = (line.number_at(i, "mark") for i in (2, 3, 4, 5))
         if min(sigmas) < 0 or (min(sigmas) == 0 and default_sigma <= 0):
             raise line.error("a standard deviation of a mark must be positive")
+        sigma_range([s or default_sigma for s in sigmas], "a standard deviation of a mark", line.complain)
         if point not in points:
             without += 1
             continue
@@ -120,24 +134,27 @@ def read(path: Path) -> Network:
 
 def _photographs(cursor: Iterator[Line]) -> tuple[list[str], list[str], list[list[float]]]:
     """Read blocks of six lines until a blank line."""
-    labels: list[str] = []
+    heads: dict[str, Line] = {}
     names: list[str] = []
     exterior: list[list[float]] = []
     for head in cursor:
         if not head.fields:
-            return labels, names, exterior
+            return list(heads), names, exterior
         try:
             pose, _sigma, _blank, _camera, _camera_sigma = (next(cursor) for _ in range(5))
         except RuntimeError:
             raise head.error("the block of this photograph is cut off") from None
-        labels.append(head.text_at(0, "photo id"))
+        label = head.text_at(0, "photo id")
+        if label in heads:
+            raise head.error(f"photo {label!r} appears twice (first in line {heads[label].number})")
+        heads[label] = head
         names.append(" ".join(head.fields[1:]))
         exterior.append([pose.number_at(i, "exterior orientation") for i in range(1, 7)])
-    return labels, names, exterior
+    return list(heads), names, exterior
 
 
-def _section(cursor: Iterator[Line], width: int) -> list[Line]:
-    """Read the lines up to the next blank one; each has `width` fields."""
+def _section(cursor: Iterator[Line], width: int, ends: bool = False) -> list[Line]:
+    """Read the lines up to the next blank one, which must be there if `ends`; each has `width` fields."""
     out = []
     for line in cursor:
         if not line.fields:
@@ -145,6 +162,9 @@ def _section(cursor: Iterator[Line], width: int) -> list[Line]:
         if len(line.fields) != width:
             raise line.error(f"{len(line.fields)} fields where {width} are expected")
         out.append(line)
+    else:
+        if ends and out:
+            raise out[-1].error("the blank line that ends this section is missing: truncated?")
     return out
 
 

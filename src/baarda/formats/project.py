@@ -136,6 +136,7 @@ def _read_parameters(file: Path, cameras: CsvTable, index: Mapping[str, int], ou
     owner = table.codes("camera", index, "camera")
     value, given = table.numbers("value", None), table.numbers("given")
     sigma, said = table.sigmas("sigma"), table.choices("state", STATES)
+    checks.sigma_range(sigma, "sigma", table.error, smallest=1e-60)
     # the same rules as for all unknowns, except that a parameter of which nothing is said is fixed
     state = np.where(said >= 0, said, np.where(sigma > 0.0, OBSERVED, FIXED))
     state = np.where((state == OBSERVED) & (sigma == 0.0), FIXED, state)
@@ -193,6 +194,7 @@ def _read_images(file: Path, cameras: tuple[Camera, ...]) -> tuple[Images, CsvTa
     rotation = np.where(np.isnan(matrix), from_angles, matrix)
     start = np.concatenate([position, np.where(np.isnan(angles), rot.to_angles(rotation), angles)], axis=1)
     known = known_values(table, EXTERIOR, start)
+    checks.sigma_range(known.sigmas, "the sigma of an orientation", table.error)
     fixed = known.states[:, 3:] == FIXED
     partly = np.flatnonzero(fixed.any(axis=1) & ~fixed.all(axis=1))
     if len(partly):
@@ -245,6 +247,7 @@ def points_of(table: CsvTable, notes: list[str], default_role: int = TIE) -> Poi
         count = int((known.without_sigma.any(axis=1) & (roles == role)).sum())
         if count:
             notes.append(f"{count} {ROLES[role]} point(s) without sigma: {'held fixed' if role == CONTROL else 'taken as exact'}")
+    checks.sigma_range(known.sigmas, "the sigma of a coordinate", table.error)
     # control starts where it was surveyed unless a start value says otherwise: start values of the rest are found from it
     start = np.where((roles == CONTROL)[:, None] & np.isnan(known.values), known.given, known.values)
     return Points(labels, start, roles, known.states, known.given, known.sigmas, correlations)
@@ -316,6 +319,7 @@ def _image_points(table: CsvTable | None, usual: Floats, images: Images, points:
         notes.append(f"{assumed} image point(s) without sigma: 1 px assumed")
     sigmas = np.where(np.isnan(sigmas), 1.0, sigmas)
     _refuse(table, (sigmas == 0.0).any(axis=1), "the sigma of an image point must be positive")
+    checks.sigma_range(sigmas, "the sigma of an image point", table.error)
     correlation = table.numbers("correlation", 0.0)
     _refuse(table, np.abs(correlation) >= 1.0, "the correlation must lie between -1 and 1")
     return ImagePoints.make(image, point, xy, sigmas, correlation)
@@ -332,6 +336,7 @@ def _distances(table: CsvTable | None, usual: Floats, images: Images, points: Po
     sigma = np.where(np.isnan(sigma), usual, sigma)
     _refuse(table, ~(values > 0.0), "the distance must be positive")
     _refuse(table, ~(sigma > 0.0), "the sigma of the distance must be there and positive")
+    checks.sigma_range(sigma, "the sigma of the distance", table.error)
     return Distances(starts, ends, values, sigma, unit=unit)
 
 

@@ -13,7 +13,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from baarda.errors import InputError, UsageError
-from baarda.formats.base import read_text
+from baarda.formats.base import label_problem, read_text
+from baarda.formats.checks import SIGMAS
 
 SCHEMA = "baarda.project/1"
 FILE = "project.toml"
@@ -23,7 +24,7 @@ KINDS = ("image_points", "distances")
 DEFAULT_NAMES = {"image_points": "image points", "distances": "distances"}
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Sigma = Annotated[float, Field(ge=SIGMAS[0], le=SIGMAS[1], allow_inf_nan=False)]
 Plane = Literal["image", "corrected"]
 
 
@@ -39,9 +40,10 @@ class SettingsTable(_Strict):
     solver: Literal["auto", "dense", "block"] | None = None
     min_rays: Annotated[int, Field(ge=0, le=1000)] | None = None
     iterations: Annotated[int, Field(ge=1, le=100_000)] | None = None
-    tolerance: Positive | None = None
+    # a coarser one would stop anywhere
+    tolerance: Annotated[float, Field(gt=0.0, le=1e-2, allow_inf_nan=False)] | None = None
     camera: tuple[str, ...] | None = None
-    image_sigma: Positive | None = None
+    image_sigma: Sigma | None = None
     residual_plane: Plane | None = None
     source: dict[str, Any] = Field(default_factory=dict)
 
@@ -56,9 +58,17 @@ class GroupTable(_Strict):
 
     name: Annotated[str, Field(min_length=1)]
     kind: Literal["image_points", "distances"] = "image_points"
-    sigma: Positive | None = None
+    sigma: Sigma | None = None
     residual_plane: Plane | None = None
     repeated: bool = False
+
+    @field_validator("name")
+    @classmethod
+    def _plain(cls, value: str) -> str:
+        problem = label_problem(value, "group")
+        if problem:
+            raise ValueError(problem)
+        return value
 
     @model_validator(mode="after")
     def _of_its_kind(self) -> GroupTable:
@@ -132,6 +142,10 @@ def read_header(path: Path) -> Header:
         message = re.sub(r" \(at .*\)$", "", str(error))
         line = int(found[1]) if found else len(text.splitlines())
         raise InputError(f"not a TOML file: {message}", path, line) from None
+    except ValueError:  # of int(): more digits than Python converts
+        at = next((i for i, t in enumerate(text.splitlines(), start=1) if re.search(r"[\d_]{4000}", t)), None)
+        raise InputError("not a TOML file: a whole number has too many digits", path, at) from None
+    _refuse_large(content, (), text, path)
     try:
         return Header.model_validate(content)
     except ValidationError as error:
@@ -143,6 +157,15 @@ def read_header(path: Path) -> Header:
         elif first["type"] == "missing":
             message = "is missing"
         raise InputError(f"{key}: {message}", path, _line_of(text, first["loc"])) from None
+
+
+def _refuse_large(value: Any, where: tuple[int | str, ...], text: str, path: Path) -> None:
+    """Refuse whole numbers of more than 64 bits, which TOML does not have."""
+    if isinstance(value, int) and value.bit_length() > 63:
+        raise InputError(f"{'.'.join(map(str, where))}: the whole number does not fit into 64 bits", path, _line_of(text, where))
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, item in items:
+        _refuse_large(item, (*where, key), text, path)
 
 
 def _line_of(text: str, where: tuple[int | str, ...]) -> int | None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from baarda.cameras import FREE, STATES, Camera
 from baarda.errors import UsageError
+from baarda.formats.base import label_problem
 from baarda.formats.csv_table import csv_text, numbers_text, quoted
 from baarda.formats.folder import write_folder
 from baarda.formats.project_file import DEFAULT_NAMES, FILE, header_text
@@ -117,6 +118,10 @@ def _labels(labels: Sequence[str], what: str) -> list[str]:
         raise UsageError(f"{what} {twice!r} appears twice")
     if not all(labels):
         raise UsageError(f"a {what} has an empty label")
+    for t in labels:
+        problem = label_problem(t, what)
+        if problem:
+            raise UsageError(f"{problem}: it cannot be written")
     return [quoted(t) for t in labels]
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baarda.errors import InputError, MissingExtra
-from baarda.formats.base import LARGEST
+from baarda.formats.base import LARGEST, regular_size
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -173,7 +173,7 @@ def _recognised(file: Path) -> tuple[_Reader, Literal["csv", "npy", "parquet"]]:
     try:
         if file.is_dir():
             raise InputError("is a folder, not a table", file)
-        size = file.stat().st_size
+        size = regular_size(file)
         with file.open("rb") as f:
             head = f.read(8)
     except FileNotFoundError:

@@ -16,6 +16,7 @@ from baarda.distributions.base import Floats
 from baarda.errors import UsageError
 from baarda.geometry import rotation as rot
 from baarda.hypotheses import Evidence
+from baarda.hypotheses._error_kurtosis import a_of_kurtosis, kurtosis_of_errors
 from baarda.network import CONTROL, Images, Network, Points, State
 from baarda.observations import ImagePoints
 from baarda.papers import _maarek_konecny_printed as p
@@ -70,26 +71,6 @@ def elementary_errors(size: int | tuple[int, ...], a: float, sigma: float, rng: 
     active = rng.binomial(number, share)
     step = sigma / np.sqrt(number * ((a + 1.0) / (a + 2.0) if np.isfinite(a) else 1.0))
     return np.asarray(step * (2.0 * rng.binomial(active, 0.5) - active))
-
-
-def a_of_kurtosis(excess: float) -> float:
-    """Return the a of a modulated normal law of given excess kurtosis: sqrt(1 + 3/excess) - 2; infinity where it is not positive.
-
-    Parameters
-    ----------
-    excess : float
-        Kurtosis minus 3.
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> a_of_kurtosis(law("radico")().excess_kurtosis()), a_of_kurtosis(-0.1)
-    (0.5, inf)
-    """
-    return float(np.sqrt(1.0 + 3.0 / excess)) - 2.0 if excess > 0.0 else float("inf")
 
 
 def grid_network(side: int, label: str, rng: np.random.Generator, errors: Floats, sigma: float) -> Network:
@@ -227,13 +208,7 @@ class Study:
         With v = -R e and independent errors of excess kurtosis g: E sum v_i^4 = sigma^4 (3 sum R_ii^2 + g sum R_ij^4) and
         E s0^4 = sigma^4 (1 + 2/r + g sum R_ii^2 / r^2): two linear equations.
         """
-        r = float(self.redundancy)
-        squares = float(self.shares @ self.shares)
-        v2 = residuals * residuals
-        left = np.array([[3.0 * squares, float(self.fourth.sum())], [1.0 + 2.0 / r, squares / r**2]])
-        right = np.stack([np.sum(v2 * v2, axis=0), (np.sum(v2, axis=0) / r) ** 2])
-        solved = np.linalg.solve(left, right.reshape(2, -1)).reshape(right.shape)
-        return solved[0], solved[1]
+        return kurtosis_of_errors(residuals, self.redundancy, self.shares, float(self.fourth.sum()))
 
     @property
     def excess_kurtosis(self) -> float:
