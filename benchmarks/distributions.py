@@ -176,7 +176,7 @@ def streams(table: Table, n: int, folder: Path, rounds: int) -> None:
         for start in range(0, n, block.size):
             store[start : start + block.size] = np.roll(block, start)[: n - start]
         store.flush()
-        del store
+        del store, block
         report(table, npy, n, rounds)
         if importlib.util.find_spec("pyarrow") is None:
             table.say("pyarrow is not installed: Parquet not measured.")

@@ -295,3 +295,16 @@ def test_reproduce(tmp_path):
     assert {p.name for p in (tmp_path / "r").iterdir()} == {"reproduce.html", "reproduce.json", "tables", "figures"}
     wrong = run("reproduce", "nobody", cwd=tmp_path)
     assert (wrong.returncode, "no paper named 'nobody'" in wrong.stderr) == (2, True)
+
+
+def test_adjustment_under_a_law(data, tmp_path):
+    done = run("adjust", data("dbat_sxb") / "sxb.xml", "--robust", "huber", "--out", "r", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "r" / "result.json").read_text())
+    assert result["law_of_errors"]["name"] == "huber"
+    names = {t["name"] for t in result["tests"]}
+    assert "check_points" in names
+    assert not names & {"global_variance_factor", "data_snooping", "control_points"}
+    assert "maximum likelihood under the huber law" in " ".join(result["assumptions"])
+    assert "uncontrolled" not in done.stdout
+    assert run("adjust", data("dbat_sxb") / "sxb.xml", "--robust", "nothing", cwd=tmp_path).returncode == 2

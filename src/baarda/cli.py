@@ -36,6 +36,10 @@ ImageSigma = Annotated[
 ]
 DatumName = Annotated[str | None, typer.Option("--datum", help="auto, control, inner or minimal.", show_default="source, else auto")]
 Solver = Annotated[str, typer.Option("--solver", help="auto, dense or block.")]
+Robust = Annotated[
+    str | None,
+    typer.Option("--robust", help="Adjust by maximum likelihood under this law of errors (see: baarda laws).", show_default=False),
+]
 Plane = Annotated[str | None, typer.Option("--residual-plane", help="image or corrected.", show_default="source")]
 MinRays = Annotated[int | None, typer.Option("--min-rays", help="Set points with fewer rays aside.", show_default="source, else 2")]
 Alpha = Annotated[float, typer.Option("--alpha", help="Level of global and parameter tests.")]
@@ -125,6 +129,7 @@ def adjust(
     datum: DatumName = None,
     solver: Solver = "auto",
     residual_plane: Plane = None,
+    robust: Robust = None,
     min_rays: MinRays = None,
     alpha: Alpha = 0.05,
     alpha_outlier: AlphaOutlier = 0.001,
@@ -147,6 +152,7 @@ def adjust(
         "datum": datum,
         "solver": solver,
         "residual_plane": residual_plane,
+        "robust": robust,
         "min_rays": min_rays,
     }
     levels = {"alpha": alpha, "alpha_outlier": alpha_outlier, "power": power, "sigma": sigma, "seed": seed}
@@ -232,6 +238,15 @@ def convert(
     if out.exists():
         raise OutputError(f"{out} exists")
     write(network, out, to)
+
+
+@app.command()
+@guarded
+def warmup() -> None:
+    """Compile the kernels once, so that later runs find them cached."""
+    from baarda.distributions.kernels import compiled
+
+    typer.echo("kernels are compiled" if compiled() is not None else "numba is not installed: the slower NumPy twins are used")
 
 
 @app.command()

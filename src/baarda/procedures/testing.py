@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baarda.adjustment import Adjustment
+from baarda.adjustment.robust import NOT_APPLICABLE
 from baarda.distributions.comparison import compare_laws
 from baarda.distributions.fitting import Fit
 from baarda.hypotheses import run
@@ -58,14 +59,18 @@ class Analysis:
 
     @cached_property
     def w(self) -> Floats:
-        """Baarda's w of every observation, a priori sigma0; NaN where uncontrolled."""
+        """Baarda's w of every observation, a priori sigma0; NaN where uncontrolled, and under a law of errors other than the normal."""
         e = self.evidence
+        if e.pv is None:
+            return np.full(len(e.residuals), np.nan)
         return standardised(_present(e.pv), _present(e.pqvvp), e.sigma0_apriori, self.adjustment.controlled_share)
 
     @cached_property
     def tau(self) -> Floats:
-        """Pope's tau of every observation, a posteriori s0; NaN where uncontrolled."""
+        """Pope's tau of every observation, a posteriori s0; NaN where uncontrolled, and under a law of errors other than the normal."""
         e = self.evidence
+        if e.pv is None:
+            return np.full(len(e.residuals), np.nan)
         return tau(_present(e.pv), _present(e.pqvvp), e.variance_factor, self.adjustment.controlled_share)
 
     @cached_property
@@ -73,7 +78,14 @@ class Analysis:
         """The observation table with w, tau, mdb, external reliability, estimated error and the p-value of the test that judges."""
         from scipy import stats
 
-        e, o, share = self.evidence, self.options, self.adjustment.controlled_share
+        e, o = self.evidence, self.options
+        if e.pv is None:
+            none = np.full(len(e.residuals), np.nan)
+            table = self.adjustment.observations
+            return Table(
+                {**table.columns, **dict.fromkeys(("w", "tau", "mdb", "external", "estimated_error", "p_value"), none)}, table.units
+            )
+        share = self.adjustment.controlled_share
         statistic, law = (self.tau, TauLaw(e.redundancy)) if o.sigma == "aposteriori" else (self.w, stats.norm())
         pv, pqvvp = _present(e.pv), _present(e.pqvvp)
         seen = np.isfinite(statistic)
@@ -133,7 +145,8 @@ def analyse(adjustment: Adjustment, options: Options | None = None) -> Analysis:
     if adjustment.status != "converged":
         return Analysis(adjustment, options, (), ())
     evidence = adjustment.evidence
-    tests = tuple(run(evidence, options))
+    applicable = NOT_APPLICABLE if adjustment.law is not None else {}
+    tests = tuple(t for t in run(evidence, options) if t.name not in applicable)
     result = Analysis(adjustment, options, tests, ())
     return Analysis(adjustment, options, tests, _laws(result))
 

@@ -89,6 +89,9 @@ def result_json(analysis: Analysis) -> dict[str, Any]:
             for h in a.history
         ],
         "datum": {"name": a.datum.name, "text": a.datum.text},
+        "law_of_errors": None
+        if a.law is None
+        else {"name": a.law.name, "values": a.law.values, "covariance_factor": a.law.covariance_factor, "resistance": a.law.resistance},
         "assumptions": list(a.assumptions),
         "points_set_aside": [net.points.labels[i] for i in np.flatnonzero(a.aside)],
         "unknowns": camera + fixed,

@@ -90,10 +90,12 @@ def _history(analysis: Analysis) -> DataTable:
         )
     columns = (
         Column("iteration", "", "0 = start values"),
-        Column("v'Pv", "", "weighted sum of squared residuals after the step"),
+        Column("v'Pv", "", "weighted sum of squared residuals after the step")
+        if analysis.adjustment.law is None
+        else Column("- log L", "", "minus the log-likelihood after the step"),
         Column("relative step", "", "change of the adjusted observations by the step, as a part of the residuals (weighted norms)"),
         Column("damping", "", "Levenberg's damping; 0 = full Gauss-Newton step"),
-        Column("step", "", "a step that does not lower v'Pv is refused and damped", "left"),
+        Column("step", "", "a step that does not lower it is refused and damped", "left"),
     )
     return DataTable("Iterations", columns, tuple(rows), first(len(history), MOST_ROWS, "the project's history"), folded=True)
 

@@ -162,6 +162,8 @@ def _superfluous(analysis: Analysis) -> Iterator[Problem]:
 
 
 def _uncontrolled(analysis: Analysis) -> Iterator[Problem]:
+    if analysis.adjustment.law is not None:  # redundancy numbers do not describe these residuals
+        return
     r = analysis.adjustment.redundancy_numbers
     lost = np.flatnonzero(np.isnan(analysis.w))
     if len(lost):
