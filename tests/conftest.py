@@ -1,5 +1,6 @@
 """Where tests find data."""
 
+import inspect
 import os
 from pathlib import Path
 
@@ -11,6 +12,15 @@ settings.load_profile("baarda")
 
 HERE = Path(__file__).parent
 SHARED = Path(os.environ.get("BAARDA_DATA", HERE.parent.parent / "shared" / "data"))
+
+
+def pytest_collection_modifyitems(items):
+    """Mark the tests that skip without an oracle, so that a second run can be confined to them."""
+    for item in items:
+        function = getattr(item, "function", None)
+        reasons = [str(m.kwargs.get("reason", "")) for m in item.iter_markers("skipif")]
+        if any("the oracle" in r for r in reasons) or (function is not None and "the oracle" in inspect.getsource(function)):
+            item.add_marker("oracle")
 
 
 def data_folder(name: str) -> Path:
