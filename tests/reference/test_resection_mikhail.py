@@ -55,6 +55,6 @@ def test_residuals_redundancy_and_tau(result):
 
 
 def test_correlations(result):
-    q = result._image_cofactors[0]
+    q = result.image_cofactors[0]
     r = q / np.sqrt(np.outer(np.diag(q), np.diag(q)))
     np.testing.assert_allclose([r[0, 4], r[1, 3], r[0, 2], r[2, 4]], [0.9819, -0.9718, 0.5696, 0.6142], atol=6e-5)

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from baarda.adjustment import tables
 from baarda.adjustment.covariance import Cofactors
 from baarda.adjustment.datum import Datum
 from baarda.adjustment.kernels import Solver
 from baarda.adjustment.linearize import Linearization, offsets_of
-from baarda.cameras import STATES
 from baarda.errors import UsageError
 from baarda.geometry import rotation as rot
 from baarda.hypotheses.base import Estimates, Evidence
-from baarda.network import AXES, CHECK, ROLES, Network, State, Table, Unknowns
+from baarda.network import AXES, CHECK, Network, State, Table, Unknowns
 from baarda.observations import CorrelatedPoints, Direct, ImagePoints, Kind
 
 if TYPE_CHECKING:
@@ -278,11 +278,12 @@ class Adjustment:
         return self.cofactors.blocks(group.columns.reshape(-1, width))
 
     @cached_property
-    def _point_cofactors(self) -> Floats:
+    def point_cofactors(self) -> Floats:
+        """(points, 3, 3) cofactors of X Y Z; zero for fixed coordinates."""
         return self._blocks("point", 3)
 
     @cached_property
-    def _image_cofactors(self) -> Floats:
+    def image_cofactors(self) -> Floats:
         """(images, 6, 6) cofactors of X0 Y0 Z0 omega phi kappa; NaN for angles at the singularity."""
         q = self._blocks("image", 6)
         t = np.zeros((len(q), 6, 6))
@@ -434,47 +435,7 @@ class Adjustment:
 
     def unknown_table(self, sigma: Scaling) -> Table:
         """Return the table of unknowns with sigmas of either variance factor."""
-        s0, numbering, net = self.scale(sigma), self.numbering, self.network
-        columns: dict[str, list[Any]] = {k: [] for k in ("name", "group", "unit", "value", "sigma", "initial", "state")}
-        order: list[int] = []
-
-        def add(column: int, *row: Any) -> None:
-            if column >= 0:
-                order.append(column)
-                for key, value in zip(columns, row, strict=True):
-                    columns[key].append(value)
-
-        camera = numbering["camera"]
-        q = {n: float(v) for n, v in zip(self.camera_estimates.names, np.diag(self.camera_estimates.cofactors), strict=True)}
-        for i, c in enumerate(net.cameras):
-            for k, name in enumerate(c.model.order):
-                full = f"camera {c.label}: {name}"
-                if full in q:
-                    state = STATES[c.states[k]]
-                    value = (full, "camera", c.unit_of(k), c.values[k], s0 * np.sqrt(q[full]), self.start.cameras[i].values[k], state)
-                    add(camera.columns[camera.offsets[i] + k], *value)
-        for kind, adjusted, first, states, units, cofactors in (
-            ("image", _exterior(net), _exterior(self.start), net.images.states, (net.unit,) * 3 + ("rad",) * 3, self._image_cofactors),
-            ("point", net.points.coordinates, self.start.points.coordinates, net.points.states, (net.unit,) * 3, self._point_cofactors),
-        ):
-            group = numbering[kind]
-            at = group.columns.reshape(adjusted.shape)
-            deviation = s0 * np.sqrt(np.einsum("nii->ni", cofactors))
-            for i, label in enumerate(group.labels):
-                names = group.parameters_of(i)
-                for k in np.flatnonzero(at[i] >= 0).tolist():
-                    row = (
-                        f"{kind} {label}: {names[k]}",
-                        kind,
-                        units[k],
-                        adjusted[i, k],
-                        deviation[i, k],
-                        first[i, k],
-                        STATES[states[i, k]],
-                    )
-                    add(at[i, k], *row)
-        arrays = {k: np.array(v, dtype=float if k in ("value", "sigma", "initial") else object) for k, v in columns.items()}
-        return Table({k: v[np.argsort(order, kind="stable")] for k, v in arrays.items()})
+        return tables.unknown_table(self, sigma)
 
     @cached_property
     def points(self) -> Table:
@@ -482,42 +443,8 @@ class Adjustment:
         return self.point_table("aposteriori")
 
     def point_table(self, sigma: Scaling, probability: float = 0.95) -> Table:
-        """Return coordinates, sigmas, correlations, rays and the confidence ellipsoid and horizontal ellipse of the points.
-
-        The semi-axes are those of the region that covers the point with `probability`: factors sqrt(k F(k, r)) a posteriori, sqrt(chi2(k))
-        a priori, k = 3 for the ellipsoid and 2 for the ellipse; the azimuth of the major axis counts from +Y clockwise, radians.
-        """
-        from scipy import stats
-
-        s0 = self.scale(sigma)
-        points = self.network.points
-        use = np.flatnonzero(~self.aside)
-        c = s0**2 * self._point_cofactors[use]
-        s = np.sqrt(np.einsum("nii->ni", c))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            r = c / (s[:, :, None] * s[:, None, :])
-        rays = np.zeros(len(points.labels), dtype=int)
-        for g in self.groups:
-            if isinstance(g, ImagePoints):
-                rays += np.bincount(g.points, minlength=len(rays))
-        factor = [
-            np.sqrt(k * stats.f(k, self.redundancy).ppf(probability)) if sigma == "aposteriori" else np.sqrt(stats.chi2(k).ppf(probability))
-            for k in (2, 3)
-        ]
-        axes3 = factor[1] * np.sqrt(np.maximum(np.linalg.eigvalsh(c), 0.0))[:, ::-1]
-        values, vectors = np.linalg.eigh(c[:, :2, :2])
-        axes2 = factor[0] * np.sqrt(np.maximum(values, 0.0))[:, ::-1]
-        azimuth = np.mod(np.arctan2(vectors[:, 0, 1], vectors[:, 1, 1]), np.pi)
-        columns: dict[str, Any] = {
-            "point": np.array(points.labels, dtype=object)[use],
-            "role": np.array(ROLES)[points.roles[use]].astype(object),
-        }
-        columns |= {a: points.coordinates[use, k] for k, a in enumerate(AXES)} | {f"s{a}": s[:, k] for k, a in enumerate(AXES)}
-        columns |= {f"corr_{a}{b}": r[:, i, j] for a, b, i, j in (("X", "Y", 0, 1), ("X", "Z", 0, 2), ("Y", "Z", 1, 2))}
-        columns["rays"] = rays[use]
-        columns |= {f"ellipsoid_{name}": axes3[:, k] for k, name in enumerate("abc")}
-        columns |= {"ellipse_a": axes2[:, 0], "ellipse_b": axes2[:, 1], "ellipse_azimuth_rad": azimuth}
-        return Table(columns, dict.fromkeys((*AXES, "sX", "sY", "sZ"), self.network.unit))
+        """Return coordinates, sigmas, correlations, rays and confidence regions of the points; see `tables.point_table`."""
+        return tables.point_table(self, sigma, probability)
 
     @cached_property
     def images(self) -> Table:
@@ -526,25 +453,7 @@ class Adjustment:
 
     def image_table(self, sigma: Scaling) -> Table:
         """Return exterior orientation with sigmas, number of points and rms of the residuals of each image."""
-        images = self.network.images
-        n = len(images.labels)
-        values = _exterior(self.network)
-        deviation = self.scale(sigma) * np.sqrt(np.einsum("nii->ni", self._image_cofactors))
-        count, square = np.zeros(n, dtype=int), np.zeros(n)
-        for g, group in enumerate(self.groups):
-            if isinstance(group, ImagePoints):
-                v = self.residuals[self.offsets[g] : self.offsets[g + 1]].reshape(-1, 2)
-                count += np.bincount(group.images, minlength=n)
-                square += np.bincount(group.images, weights=(v**2).sum(axis=1), minlength=n)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            rms = np.sqrt(square / (2 * count))
-        names = ("X0", "Y0", "Z0", "omega_rad", "phi_rad", "kappa_rad")
-        columns: dict[str, Any] = {
-            "image": np.array(images.labels, dtype=object),
-            "camera": np.array([c.label for c in self.network.cameras], dtype=object)[images.cameras],
-        }
-        columns |= {name: values[:, k] for k, name in enumerate(names)} | {f"s{name}": deviation[:, k] for k, name in enumerate(names)}
-        return Table(columns | {"points": count, "rms": rms})
+        return tables.image_table(self, sigma)
 
     @cached_property
     def behind(self) -> list[tuple[str, str]]:
@@ -570,8 +479,3 @@ class Adjustment:
     def with_assumptions(self, *more: str) -> Adjustment:
         """Return the result with further assumptions for the report."""
         return replace(self, assumptions=(*self.assumptions, *more))
-
-
-def _exterior(network: Network) -> Floats:
-    """(images, 6): X0 Y0 Z0 omega phi kappa."""
-    return np.concatenate([network.images.position, rot.to_angles(network.images.rotation)], axis=1)
