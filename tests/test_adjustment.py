@@ -9,9 +9,10 @@ from scipy import linalg
 import baarda
 from baarda import cameras
 from baarda.adjustment.linearize import linearize, whitened_misclosures
+from baarda.adjustment.solve import Settings, active_groups, prepare
 from baarda.cameras import FIXED, FREE, OBSERVED
 from baarda.errors import DatumDefect, RedundancyNotPositive, Singular, UsageError
-from baarda.network import Images, Network, Points, State
+from baarda.network import Images, Network, Points, State, unknowns_of
 from baarda.observations import Distances, ImagePoints
 from networks import BROWN, FREE_BROWN, ring, with_distances
 
@@ -158,8 +159,6 @@ def test_partials_of_every_network_against_differences(solved):
     _, dense, _ = solved
     state = State.of(dense.network.shifted(dense.shift))
     net = dense.network.shifted(dense.shift)
-    from baarda.adjustment.solve import active_groups
-
     groups = active_groups(net, ~dense.aside)
     lin = linearize(net, state, dense.numbering, groups)
     rng = np.random.default_rng(5)
@@ -402,3 +401,18 @@ def test_distances_to_points_set_aside_are_told():
     )
     r = baarda.adjust(n)
     assert any("1 of 1 distances end at points set aside" in text for text in r.assumptions)
+
+
+def test_weights_do_not_change_the_datum_defect():
+    """Tiny image sigmas beside weighted control: the datum stays defined; where digits run out, the weights are named."""
+    from baarda.adjustment.datum import find_defect
+
+    n = ring(control=5)
+    for sigma in (1.0, 1e-4, 1e-8, 1e-11):
+        prepared, aside, _ = prepare(n, Settings(image_sigma=sigma))
+        prepared = prepared.shifted(-prepared.centroid())
+        state = State.of(prepared)
+        lin = linearize(prepared, state, unknowns_of(prepared, ~aside), active_groups(prepared, ~aside))
+        assert find_defect(lin, state).count == 0
+    with pytest.raises(Singular, match="sigmas are too different"):
+        baarda.adjust(n, image_sigma=1e-10)

@@ -90,8 +90,12 @@ def find_defect(lin: Linearization, state: State, tolerance: float = 1e-18) -> D
     Defect
     """
     g = similarity_directions(lin.unknowns, state)
-    image = lin.design @ g
-    gross = (g * lin.scale[:, None] ** 2).T @ g
+    # Rows are brought to one size: what changes no observation does so whatever the weights are, and a weak observation must not drown.
+    square = lin.design.power(2)
+    size = square @ (g**2).sum(axis=1)
+    weight_of_row = np.divide(1.0, np.sqrt(size), out=np.zeros_like(size), where=size > 0.0)
+    image = weight_of_row[:, None] * (lin.design @ g)
+    gross = (g * (square.T @ weight_of_row**2)[:, None]).T @ g
     net = image.T @ image
     weight = np.sqrt(np.maximum(np.diag(gross), np.finfo(float).tiny))
     net, gross = net / np.outer(weight, weight), gross / np.outer(weight, weight)

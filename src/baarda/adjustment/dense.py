@@ -115,4 +115,7 @@ def factorise(matrix: Floats, columns: list[Ints], lin: Linearization) -> tuple[
     order = np.argsort(-share, kind="stable")
     hit = [names[at[i]] for i in order if share[i] > 0.02 * share.max()]
     shown = ", ".join(hit[:12]) + (f" and {len(hit) - 12} more" if len(hit) > 12 else "")
-    raise Singular(f"the observations do not determine {len(null.T)} combination(s) of unknowns; involved: {shown}", hit)
+    rows = np.sqrt(lin.design.power(2) @ (1.0 / lin.scale**2))
+    spread = rows.max() / rows[rows > 0.0].min()
+    hint = f" (or the a-priori sigmas are too different: weighted observations differ by a factor of {spread:.0e})" if spread > 1e6 else ""
+    raise Singular(f"the observations do not determine {len(null.T)} combination(s) of unknowns; involved: {shown}{hint}", hit)

@@ -68,6 +68,8 @@ class Options:
     def __post_init__(self) -> None:
         for name in ("alpha", "alpha_outlier", "power"):
             check_level(getattr(self, name), name)
+            if getattr(self, name) < 1e-12:
+                raise UsageError(f"{name} must be at least 1e-12, not {getattr(self, name)!r}")
         if self.power <= self.alpha_outlier:
             raise UsageError(f"the power ({self.power}) must exceed the level alpha_outlier ({self.alpha_outlier})")
         if self.sigma not in ("aposteriori", "apriori"):
