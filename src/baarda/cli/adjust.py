@@ -1,0 +1,88 @@
+"""`baarda adjust`."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from baarda.cli.base import (
+    Alpha,
+    AlphaOutlier,
+    CameraList,
+    Control,
+    DatumName,
+    FormatName,
+    ImageSigma,
+    Json,
+    MinRays,
+    Out,
+    Plane,
+    Power,
+    Quiet,
+    Robust,
+    Seed,
+    SigmaName,
+    Solver,
+    Strict,
+    Tables,
+    app,
+    guarded,
+)
+from baarda.cli.run import adjust_and_report
+
+
+@app.command()
+@guarded
+def adjust(
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="File or folder of any known format.")],
+    out: Out = None,
+    format: FormatName = None,
+    control: Control = None,
+    camera: CameraList = "source",
+    image_sigma: ImageSigma = None,
+    datum: DatumName = None,
+    solver: Solver = "auto",
+    residual_plane: Plane = None,
+    robust: Robust = None,
+    min_rays: MinRays = None,
+    alpha: Alpha = 0.05,
+    alpha_outlier: AlphaOutlier = 0.001,
+    power: Power = 0.80,
+    sigma: SigmaName = "aposteriori",
+    seed: Seed = 0,
+    tables: Tables = "csv",
+    as_json: Json = False,
+    quiet: Quiet = False,
+    strict: Strict = False,
+) -> None:
+    """Read a block, adjust it, test it, and write the result folder (default: baarda-out)."""
+    from baarda.formats import read
+
+    started = time.perf_counter()
+    network = read(source, format=format, control=control)
+    settings = {
+        "camera": camera_list(camera, network),
+        "image_sigma": image_sigma,
+        "datum": datum,
+        "solver": solver,
+        "residual_plane": residual_plane,
+        "robust": robust,
+        "min_rays": min_rays,
+    }
+    levels = {"alpha": alpha, "alpha_outlier": alpha_outlier, "power": power, "sigma": sigma, "seed": seed}
+    target = None if as_json and out is None else out or Path("baarda-out")
+    adjust_and_report(network, settings, levels, target, tables, as_json, quiet, strict, started)
+
+
+def camera_list(text: str, network: Any) -> tuple[str, ...] | None:
+    """Read --camera: None leaves the source's states."""
+    if text == "source":
+        return None
+    if text == "none":
+        return ()
+    if text == "all":
+        return tuple(dict.fromkeys(name for c in network.cameras for name in c.model.order))
+    return tuple(name.strip() for name in text.split(",") if name.strip())

@@ -1,0 +1,86 @@
+"""The application, the options that mean the same everywhere, and the exit codes."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from baarda import __version__
+from baarda.errors import BaardaError
+
+app = typer.Typer(
+    name="baarda",
+    help="Adjust photogrammetric observations by rigorous least squares and test everything that comes out.",
+    no_args_is_help=True,
+    add_completion=True,
+    pretty_exceptions_enable=False,
+)
+
+Out = Annotated[Path | None, typer.Option("--out", help="Result folder to write; there whole or not at all.", show_default=False)]
+Control = Annotated[Path | None, typer.Option("--control", help="Table of control and check points.", show_default=False)]
+FormatName = Annotated[
+    str | None, typer.Option("--format", help="Format of the source; by default recognised by content.", show_default=False)
+]
+CameraList = Annotated[
+    str, typer.Option("--camera", help="Camera parameters to estimate: 'source', 'none', 'all', or a list such as principal_distance,K1.")
+]
+ImageSigma = Annotated[
+    float | None, typer.Option("--image-sigma", help="A-priori sigma of all image coordinates, pixels.", show_default=False)
+]
+DatumName = Annotated[str | None, typer.Option("--datum", help="auto, control, inner or minimal.", show_default="source, else auto")]
+Solver = Annotated[str, typer.Option("--solver", help="auto, dense or block.")]
+Robust = Annotated[
+    str | None,
+    typer.Option("--robust", help="Adjust by maximum likelihood under this law of errors (see: baarda laws).", show_default=False),
+]
+Plane = Annotated[str | None, typer.Option("--residual-plane", help="image or corrected.", show_default="source")]
+MinRays = Annotated[int | None, typer.Option("--min-rays", help="Set points with fewer rays aside.", show_default="source, else 2")]
+Alpha = Annotated[float, typer.Option("--alpha", help="Level of global and parameter tests.")]
+AlphaOutlier = Annotated[float, typer.Option("--alpha-outlier", help="Level of the test of one observation.")]
+Power = Annotated[float, typer.Option("--power", help="Power behind minimal detectable biases.")]
+SigmaName = Annotated[str, typer.Option("--sigma", help="Which variance factor judges and scales: aposteriori (tau) or apriori (w).")]
+Seed = Annotated[int, typer.Option("--seed", help="Seed of simulated null laws.")]
+Tables = Annotated[str, typer.Option("--tables", help="Format of the tables: csv or parquet.")]
+Json = Annotated[bool, typer.Option("--json", help="Print result.json to stdout; the folder is written only with --out.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress and no verdict.")]
+Strict = Annotated[bool, typer.Option("--strict", help="Exit with 1 when the global, outlier, check point or control point test rejects.")]
+
+
+def guarded(function: Callable[..., None]) -> Callable[..., None]:
+    """Turn every foreseen failure into one message and the exit code of the contract."""
+
+    @functools.wraps(function)
+    def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            function(*args, **kwargs)
+        except BaardaError as error:
+            typer.echo(f"baarda: {error}", err=True)
+            raise typer.Exit(error.exit_code) from None
+        except KeyboardInterrupt:
+            typer.echo("baarda: interrupted, nothing was written", err=True)
+            raise typer.Exit(130) from None
+        except MemoryError:
+            typer.echo("baarda: out of memory, nothing was written", err=True)
+            raise typer.Exit(4) from None
+        except BrokenPipeError:
+            sys.stderr.close()
+            raise typer.Exit(4) from None
+        except OSError as error:
+            place = f" {error.filename}" if error.filename else ""
+            typer.echo(f"baarda: cannot read or write{place}: {error.strerror or error}", err=True)
+            raise typer.Exit(4) from None
+
+    return run
+
+
+@app.callback(invoke_without_command=True)
+def root(version: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False) -> None:
+    """Adjust photogrammetric observations by rigorous least squares and test everything that comes out."""
+    if version:
+        typer.echo(f"baarda {__version__}")
+        raise typer.Exit(0)

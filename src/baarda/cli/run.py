@@ -1,0 +1,68 @@
+"""Adjust, test, write the folder and print the verdict: what `demo` and `adjust` share."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from baarda.errors import UsageError
+
+
+def adjust_and_report(
+    network: Any,
+    settings: dict[str, Any],
+    levels: dict[str, Any],
+    out: Path | None,
+    tables: str,
+    as_json: bool,
+    quiet: bool,
+    strict: bool,
+    started: float,
+) -> None:
+    """Adjust a network, test it, write the result folder, print verdict or JSON, and leave with the exit code of the contract."""
+    from baarda.adjustment import adjust as adjust_network
+    from baarda.formats.folder import check_target
+    from baarda.hypotheses.levels import Options
+    from baarda.procedures.testing import analyse
+    from baarda.report import page
+    from baarda.report.result_folder import MARK, result_json, write_folder
+
+    if tables not in ("csv", "parquet"):
+        raise UsageError(f"--tables is csv or parquet, not {tables!r}")
+    options = Options(**levels)
+    if out is not None:
+        check_target(out, MARK)
+
+    def progress(step: Any) -> None:
+        relative = "" if step.relative_step is None else f"  relative step {step.relative_step:.1e}"
+        damping = f"  damping {step.damping:.0e}" if step.damping else ""
+        taken = "" if step.accepted else "  rejected"
+        typer.echo(f"iteration {step.count:>2}  v'Pv {step.objective:.10g}{relative}{damping}{taken}", err=True)
+
+    result = adjust_network(network, **settings, progress=None if quiet else progress)
+    if not quiet:
+        typer.echo("testing and writing ...", err=True)
+    analysis = analyse(result, options)
+    if out is not None:
+        write_folder(analysis, out, tables, {"seconds": round(time.perf_counter() - started, 3)})
+    if as_json:
+        typer.echo(json.dumps(result_json(analysis), indent=1, allow_nan=False, ensure_ascii=False))
+        sys.stdout.flush()
+    elif not quiet:
+        for sentence in page.verdict(analysis):
+            typer.echo(sentence)
+    if out is not None and not quiet:
+        typer.echo(f"report: {out / 'report.html'}", err=True)
+    if not analysis.converged:
+        steps = len(result.history) - 1
+        typer.echo(f"baarda: not converged after {steps} iterations, nothing was tested; {result.contradictions()}", err=True)
+        raise typer.Exit(3)
+    if strict and any(analysis.gates.values()):
+        failed = ", ".join(name for name, rejected in analysis.gates.items() if rejected)
+        typer.echo(f"baarda: rejected: {failed}", err=True)
+        raise typer.Exit(1)
