@@ -48,7 +48,7 @@ def test_demo_numbers(two_demos):
     names = {t["name"] for t in result["tests"]}
     assert names >= {"global_variance_factor", "mean_of_residuals", "skewness_of_residuals", "kurtosis_of_residuals", "bartlett_images"}
     assert names >= {"variance_per_image", "all_additional_parameters", "additional_parameter", "data_snooping"}
-    assert [law["law"] for law in result["laws"]] == ["normal", "radico", "lineo", "modulated_normal"]
+    assert [law["law"] for law in result["laws"]][:4] == ["normal", "radico", "lineo", "modulated_normal"]
     assert len(result["outliers"]) == 45
     assert (result["outliers"][0]["image"], result["outliers"][0]["point"]) == ("19", "8")
     pair = next(p for p in result["correlations"] if {p["a"], p["b"]} == {"camera 1: K2", "camera 1: K3"})

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from baarda.errors import RedundancyNotPositive, Singular, UsageError
-from baarda.hypotheses import _linear_model, parameters
+from baarda.hypotheses import _linear_model, orthogonalisation, parameters
 from baarda.hypotheses.base import Estimates, Evidence
 from baarda.hypotheses.levels import Options, single_level
 
@@ -130,9 +130,9 @@ def test_pairs_above_the_limit_or_the_most_correlated_one() -> None:
 def test_orthogonalised_parameters_sum_to_the_joint_test_and_lead_back(basis: str) -> None:
     _, _, e = model(7)
     x, q, s2, r = e.additional.values, e.additional.cofactors, e.variance_factor, e.redundancy
-    t = parameters.orthogonalised_parameters(x, q, s2, r, basis=basis)  # type: ignore[arg-type]
+    t = orthogonalisation.orthogonalised_parameters(x, q, s2, r, basis=basis)  # type: ignore[arg-type]
     assert (t.statistic**2).sum() / 4 == pytest.approx(parameters.general_linear(x, q, s2, r).statistic, rel=1e-9)
-    o = parameters.orthogonalise(x, q, basis)  # type: ignore[arg-type]
+    o = orthogonalisation.orthogonalise(x, q, basis)  # type: ignore[arg-type]
     np.testing.assert_allclose(o.back @ o.values, x, rtol=1e-9)
     np.testing.assert_allclose(o.back @ np.diag(o.cofactors) @ o.back.T, q, rtol=1e-9, atol=1e-12)
 
@@ -141,8 +141,8 @@ def test_orthogonalised_parameters_sum_to_the_joint_test_and_lead_back(basis: st
 def test_eigen_basis_does_not_depend_on_units(units: list[float]) -> None:
     _, _, e = model(8)
     x, q, u = e.additional.values, e.additional.cofactors, np.array(units)
-    one = parameters.orthogonalised_parameters(x, q, 1.0, 9)
-    two = parameters.orthogonalised_parameters(x * u, q * u[:, None] * u, 1.0, 9)
+    one = orthogonalisation.orthogonalised_parameters(x, q, 1.0, 9)
+    two = orthogonalisation.orthogonalised_parameters(x * u, q * u[:, None] * u, 1.0, 9)
     np.testing.assert_allclose(one.statistic, two.statistic, rtol=1e-6)
     assert one.labels == two.labels
 
@@ -174,7 +174,14 @@ def test_perfectly_correlated_pair_is_said_in_words() -> None:
     assert "K2" in joint.note
     assert joint.statistic == pytest.approx((1.0 + 0.125) / 2, rel=1e-9)
     assert np.isfinite(found["additional_parameter"].p_value).all()
-    assert set(found) == {"all_additional_parameters", "additional_parameter"}
+    pair = found["bivariate_additional_parameters"]
+    assert pair.note.startswith("Not applicable: the parameters are perfectly correlated")
+    assert pair.labels == ("K1, K2",)
+    assert np.isnan(pair.statistic).all()
+    assert not pair.rejected.any()
+    for t in orthogonalisation.from_evidence(dependent(1.0), Options()):
+        assert t.note.startswith("Not applicable: K2 is a linear combination")
+        assert t.details["tested"] == 0
 
 
 def test_perfect_pair_among_others_is_left_out_by_name() -> None:
@@ -185,11 +192,9 @@ def test_perfect_pair_among_others_is_left_out_by_name() -> None:
 
 
 def test_all_insignificant_parameters() -> None:
-    found = parameters.from_evidence(
-        Evidence(residuals=np.zeros(9), sigmas=np.ones(9), vpv=7.0, redundancy=7, additional=Estimates(("a", "b"), np.zeros(2), np.eye(2))),
-        Options(),
-    )
-    assert len(found) == 4
+    e = Evidence(residuals=np.zeros(9), sigmas=np.ones(9), vpv=7.0, redundancy=7, additional=Estimates(("a", "b"), np.zeros(2), np.eye(2)))
+    found = [*parameters.from_evidence(e, Options()), *orthogonalisation.from_evidence(e, Options())]
+    assert len(found) == 5
     assert not any(np.any(t.rejected) for t in found)
 
 
@@ -203,7 +208,7 @@ def test_all_insignificant_parameters() -> None:
         lambda: parameters.general_linear([np.nan], [[1.0]], 1.0, 4),
         lambda: parameters.single_parameter([1.0], [0.0], 1.0, 4, names=["K1"]),
         lambda: parameters.bivariate_parameters([1.0], [[1.0]], 1.0, 4),
-        lambda: parameters.orthogonalise([1.0], [[1.0]], "fourier"),  # type: ignore[arg-type]
+        lambda: orthogonalisation.orthogonalise([1.0], [[1.0]], "fourier"),  # type: ignore[arg-type]
     ],
 )
 def test_wrong_arguments(call: object) -> None:

@@ -151,7 +151,9 @@ def test_correlated_observations_keep_the_simulated_law_fitting() -> None:
 def test_asymptotic_law_is_said() -> None:
     e = network(3)
     bare = Evidence(**{**vars(e), "residuals_of": None})
-    for t in [*homogeneity.from_evidence(bare, Options()), *moments.from_evidence(bare, Options())]:
+    *of_moments, jarque_bera = moments.from_evidence(bare, Options())
+    assert "independent normal values" in jarque_bera.note
+    for t in [*homogeneity.from_evidence(bare, Options()), *of_moments]:
         assert "Asymptotic" in t.note
         assert not isinstance(t.law, SimulatedLaw)
 
@@ -177,7 +179,7 @@ def test_simulated_law_does_not_depend_on_chunks(monkeypatch: pytest.MonkeyPatch
 
 def test_kurtosis_of_residuals_is_nearer_to_normal_than_that_of_errors() -> None:
     # The simulated law is that of residuals of normal errors: its centre is below the one of independent values.
-    (_, _, kurtosis) = moments.from_evidence(network(5, sets=2), Options(replicas=499))
+    (_, _, kurtosis, _) = moments.from_evidence(network(5, sets=2), Options(replicas=499))
     assert "499 simulated" in kurtosis.note
     assert 0.0 < kurtosis.p_value <= 1.0
 
@@ -187,7 +189,9 @@ def test_uncontrolled_observations_are_left_out_and_counted() -> None:
     a = np.ones((30, 2))
     a[:-1, 1] = 0.0
     e = linear_model(a, rng.standard_normal(30), images=np.arange(30) % 3)
-    for t in moments.from_evidence(e, Options(replicas=99)):
+    mean, *others = moments.from_evidence(e, Options(replicas=99))
+    assert mean.details["applicable"] is False  # the residuals of the common mean sum to zero
+    for t in others:
         assert t.details["n"] == 29
         assert "1 uncontrolled" in t.note
 

@@ -13,7 +13,8 @@ from scipy import stats
 from baarda.distributions import fit, law
 from baarda.errors import InputError, OutputError, UsageError
 from baarda.hypotheses.goodness_of_fit import anderson_darling, cramer_von_mises, kolmogorov
-from baarda.procedures.law_study import SIMULATED, STATISTICS, StudyOptions, class_limits, empirical_tests, study_laws
+from baarda.procedures.law_bootstrap import CHI_SQUARE, SIMULATED, STATISTICS, empirical_tests
+from baarda.procedures.law_study import StudyOptions, class_limits, study_laws
 from baarda.procedures.residual_study import study
 from baarda.report.residual_report import run
 
@@ -339,7 +340,7 @@ def test_result_folder(outcome):
     assert document["verdict"] == made.verdict
     assert {p.name for p in (folder / "out" / "tables").iterdir()} == {"groups.csv", "classes.csv", "laws.csv", "scale_rules.csv"}
     assert document["laws"][0]["law"] == "normal"
-    assert all(set(item["distribution_tests"]) == set(STATISTICS) for item in document["laws"])
+    assert all(set(item["distribution_tests"]) == {*STATISTICS, CHI_SQUARE} for item in document["laws"])
     described = [r for r in document["scale_rules"] if r["descriptive"]]
     assert [r["symbol"] for r in described] == ["S_o"] and described[0]["p_value"] is None
     assert len((folder / "out" / "tables" / "laws.csv").read_text().splitlines()) == 10

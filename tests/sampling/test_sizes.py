@@ -7,8 +7,21 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from scipy import stats
+from threadpoolctl import threadpool_limits
 
-from baarda.hypotheses import _linear_model, check_points, data_snooping, deformation_point, global_variance_factor, image_points, run
+from baarda.hypotheses import (
+    _linear_model,
+    check_points,
+    data_snooping,
+    deformation_point,
+    global_variance_factor,
+    goodness_of_fit,
+    homogeneity,
+    image_points,
+    moments,
+    run,
+    variance_factor,
+)
 from baarda.hypotheses import deformation as deformation_test
 from baarda.hypotheses.base import Evidence
 from baarda.hypotheses.levels import Options, Policy, power_of_test
@@ -16,6 +29,13 @@ from baarda.hypotheses.outliers import delta0
 from baarda.hypotheses.parameters import bivariate_parameters, general_linear
 
 pytestmark = pytest.mark.sampling
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    with threadpool_limits(limits=1, user_api="blas"):  # the matrices are small: threads would only wait for each other
+        yield
+
 
 LEVELS = (0.10, 0.05, 0.01)
 SETS, PER_SET, CONTROL, REPLICAS = 5, 14, 5, 199
@@ -85,6 +105,32 @@ def test_every_test_has_its_level(correlated: bool, sigma: str) -> None:
                 # Simulated p-values are multiples of 1/200 (two-sided 2/200): "p <= level" is exact, "p < level" a step below.
                 rates.setdefault((t.name, level), []).append(float((p <= level + 1e-12).mean()))
     assert len({name for name, _ in rates}) >= 15
+    wrong = {key: (np.mean(x), z) for key, x in rates.items() if abs(z := z_of_rates(x, key[1])) > 4.0}
+    assert not wrong
+
+
+@pytest.mark.parametrize("correlated", [False, True], ids=["diagonal", "correlated"])
+def test_the_tests_of_residuals_have_their_level(correlated: bool) -> None:
+    """Mean by 1'Qvv1, skewness, kurtosis, Jarque-Bera, Bartlett, each image, Anderson-Darling, variance factor: 4000 adjustments."""
+    network = Network(correlated)
+    members = (variance_factor, moments, homogeneity, goodness_of_fit)
+    rates: dict[tuple[str, float], list[float]] = {}
+    for k, e in replicas(network, 4000, 15):
+        options = Options(seed=2_000_000 + k, replicas=REPLICAS)
+        for t in (t for m in members for t in m.from_evidence(e, options)):
+            p = np.atleast_1d(t.p_value)
+            for level in LEVELS:
+                rates.setdefault((t.name, level), []).append(float((p <= level + 1e-12).mean()))
+    assert {name for name, _ in rates} == {
+        "global_variance_factor",
+        "mean_of_residuals",
+        "skewness_of_residuals",
+        "kurtosis_of_residuals",
+        "jarque_bera",
+        "bartlett_images",
+        "variance_per_image",
+        "goodness_of_fit",
+    }
     wrong = {key: (np.mean(x), z) for key, x in rates.items() if abs(z := z_of_rates(x, key[1])) > 4.0}
     assert not wrong
 

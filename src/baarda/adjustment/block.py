@@ -1,293 +1,394 @@
-"""The block solver: object points are eliminated one by one, the rest is factored as one reduced system.
+"""The block solver: object points are eliminated one by one, the rest by a multifrontal Cholesky factorisation.
 
-For each point the whitened partials G_p (rows x 3) are factored orthogonally, G_p = Q1 R1, so that nearly parallel rays lose no
-digits; with Y = Q1' G_r the reduced matrix is S = G_r' G_r - Y'Y. Points are treated in batches of equal numbers of row blocks.
+The same fronts, taken the other way, give the *selected inverse* (Takahashi, Fagan & Chin 1973): every block of the inverse whose nodes
+share a point, which is all that the cofactors of points and the redundancy numbers need. No array of the size u x u anywhere.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse
+from scipy.sparse.linalg import LinearOperator, onenormest
 
-from baarda.adjustment.dense import factorise
+from baarda.adjustment import lapack
+from baarda.adjustment.dense import refuse_null_space
+from baarda.adjustment.kernels import Blocks, Kernels, blocks_of, kernels
 from baarda.adjustment.linearize import Linearization
+from baarda.adjustment.structure import Front, Structure
+from baarda.adjustment.workers import run_tree
 from baarda.errors import Singular
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+Bools = NDArray[np.bool_]
 
-BATCH = 4_000_000  # doubles in the largest temporary of a batch
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Points with the same number k of row blocks, of m rows and w reduced columns each.
-
-    Attributes
-    ----------
-    blocks : (P, k) int array
-        Row blocks of each point.
-    columns : (P, 3) int array
-        Unknowns of each point.
-    reduced : (P, k w) int array
-        Reduced columns; the last index is a dummy.
-    gr : (P, k, m, w), q1 : (P, k, m, 3), r1 : (P, 3, 3), y : (P, 3, k w) arrays
-    """
-
-    blocks: Ints
-    columns: Ints
-    reduced: Ints
-    gr: Floats
-    q1: Floats
-    r1: Floats
-    y: Floats
+SEARCHED = 4000  # columns up to which a null space is sought in the whole reduced matrix
+SMALLEST_PIVOT = 1e-15  # of a column scaled to length 1: what other unknowns leave of its square
 
 
 @dataclass(frozen=True)
 class BlockSolver:
-    """Factored normal equations with eliminated points; see `baarda.adjustment.kernels.Solver` for the contract."""
+    """Factored normal equations with eliminated points; see `baarda.adjustment.solver.Solver` for the contract."""
 
     lin: Linearization
-    kept: Ints
-    place: Ints
-    batches: tuple[Batch, ...]
-    rest: tuple[tuple[Ints, Ints, Floats], ...]
-    ident: tuple[Ints, Ints]
-    factor: Floats
-    scale: Floats
-    rcond: float
+    structure: Structure
+    inverse: Floats
+    blocks_: Blocks
+    loops: Kernels
+    triangles: Floats
+    panels: tuple[Floats, ...]
+    size: Ints
+    _cache: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @staticmethod
-    def of(lin: Linearization, held: Ints, damping: float = 0.0) -> BlockSolver:
+    def of(lin: Linearization, structure: Structure, held: Ints, damping: float = 0.0) -> BlockSolver:
         """Eliminate the points and factor the reduced system; held unknowns stay out.
+
+        Parameters
+        ----------
+        lin : Linearization
+        structure : Structure
+            Of this system, from `baarda.adjustment.structure.analyse`.
+        held : (k,) int array
+            Unknowns that stay where they are.
+        damping : float
+            Added to the diagonal of the normal matrix whose columns have length 1.
 
         Raises
         ------
         Singular
             If a point or a combination of unknowns is not determined.
         """
-        u = lin.unknowns.count
-        eliminated = eliminated_points(lin, held)
-        point_columns = lin.unknowns["point"].columns.reshape(-1, 3)
-        inner = np.zeros(u + 1, dtype=bool)
-        inner[point_columns[eliminated].ravel()] = True
-        inner[held], inner[u] = True, True
-        kept = np.flatnonzero(~inner[:u])
-        place = np.full(u + 1, len(kept))  # the last one also serves column -1
-        place[kept] = np.arange(len(kept))
+        inverse = np.append(1.0 / lin.scale, 0.0)
+        inverse[held] = 0.0
+        arrays = blocks_of(lin, structure, inverse, damping)
+        loops = kernels(len(structure.block_row))
+        size = _sizes(structure, arrays)
+        triangles = np.zeros((len(structure.points), 3, 3))
+        bad = np.zeros(len(structure.points), dtype=bool)
+        panels: list[Floats | None] = [None] * len(structure.fronts)
+        updates: dict[int, Floats] = {}
+        rest = _rest_by_front(lin, structure, inverse)
+        diagonal = np.where(inverse[structure.order] > 0.0, damping, 1.0)
+        weak: list[tuple[int, Floats, bool]] = []
 
-        size = len(kept)
-        s = np.zeros((size + 1) * (size + 1))
-        node, first, reduced, gr, gp, rest = _row_blocks(lin, eliminated, place)
-        for at, _, jacobian in rest:
-            _scatter(s, size, at, np.einsum("nmi,nmj->nij", jacobian, jacobian))
-        _scatter(s, size, reduced, np.einsum("nmi,nmj->nij", gr, gr))
-        batches = []
-        order = np.argsort(node, kind="stable")
-        nodes, starts, counts = np.unique(node[order], return_index=True, return_counts=True)
-        w = gr.shape[2]
-        for k in np.unique(counts):
-            members = np.flatnonzero(counts == k)
-            step = max(1, BATCH // int(max(k * w, 3) ** 2))
-            for a in range(0, len(members), step):
-                some = members[a : a + step]
-                blocks = order[starts[some][:, None] + np.arange(k)]
-                batch = _eliminate(blocks, point_columns[nodes[some]], reduced, gr, gp, damping, lin)
-                _scatter(s, size, batch.reduced, -(batch.y.transpose(0, 2, 1) @ batch.y))
-                batches.append(batch)
-        scale = lin.scale[kept]
-        matrix = s.reshape(size + 1, size + 1)[:size, :size] / np.outer(scale, scale)
-        matrix = 0.5 * (matrix + matrix.T) + damping * np.eye(size)
-        factor, rcond = factorise(matrix, [kept], lin)
-        return BlockSolver(lin, kept, place, tuple(batches), rest, first, factor, scale, rcond)
+        def factor(f: int) -> None:
+            front = structure.fronts[f]
+            n, p = len(front.columns), front.pivots
+            matrix = np.zeros((n, n))
+            loops.accumulate(front.clusters, matrix, arrays, triangles, bad, size)
+            for at, jacobian in rest.get(f, ()):
+                _add_rows(matrix, at, jacobian)
+            for child in front.children:
+                loops.extend(matrix, updates.pop(child), structure.fronts[child].into_parent)
+            matrix[np.arange(p), np.arange(p)] += diagonal[front.begin : front.begin + p]
+            before = matrix[:p, :p].copy()
+            info = lapack.cholesky(matrix[:p, :p])
+            if info or np.diagonal(matrix)[:p].min(initial=1.0) ** 2 < SMALLEST_PIVOT:
+                weak.append((f, before, info != 0))
+                if info:
+                    raise Singular("not positive definite", [])
+            if p < n:
+                lapack.solve_right_transposed(matrix[:p, :p], matrix[p:, :p])
+                update = matrix[p:, p:]
+                lapack.subtract_square(matrix[p:, :p], update)
+                updates[f] = update.copy()
+            panels[f] = np.ascontiguousarray(matrix[:, :p])
 
+        orphans = _orphans(structure)
+        loops.accumulate(orphans, np.zeros((0, 0)), arrays, triangles, bad, size)
+        with suppress(Singular):  # the reason is found below
+            run_tree([len(f.children) for f in structure.fronts], [_after(f) for f in structure.fronts], factor, lin.workers)
+        if bad.any():
+            _refuse_points(lin, structure.point_columns[bad])
+        if weak:
+            _refuse_nodes(lin, structure, inverse, arrays, loops, size, diagonal, *min(weak, key=lambda w: w[0]))
+        return BlockSolver(lin, structure, inverse, arrays, loops, triangles, tuple(p for p in panels if p is not None), size)
+
+    @property
+    def count(self) -> int:
+        """The number of columns of the reduced system."""
+        return len(self.structure.order)
+
+    # ---- solving ----
     def solve(self, rhs: Floats) -> Floats:
         """Return N^-1 rhs for (u,) or (u, k) right-hand sides; held unknowns stay zero."""
-        columns = rhs.reshape(len(rhs), -1)
-        out = np.zeros_like(columns)
-        halves = [np.linalg.solve(b.r1.transpose(0, 2, 1), columns[b.columns]) for b in self.batches]
-        z = np.concatenate([h.reshape(-1, columns.shape[1]) for h in halves]) if halves else np.zeros((0, columns.shape[1]))
-        reduced = columns[self.kept] - self.coupling.T @ z
-        x = np.zeros_like(reduced)
-        if len(self.kept):
-            x = linalg.cho_solve((self.factor, True), reduced / self.scale[:, None]) / self.scale[:, None]
-        out[self.kept] = x
-        z -= self.coupling @ x
-        a = 0
-        for batch in self.batches:
-            n = len(batch.columns)
-            out[batch.columns] = np.linalg.solve(batch.r1, z[a : a + 3 * n].reshape(n, 3, -1))
-            a += 3 * n
-        return out.reshape(rhs.shape)
+        k = rhs.size // max(len(rhs), 1)
+        columns = np.concatenate([rhs.reshape(len(rhs), -1), np.zeros((1, k))]) * self.inverse[:, None]
+        own, order = self.structure.point_columns, self.structure.order
+        x, reduced = np.zeros_like(columns), columns[order]
+        z = self._points(columns[own])
+        if z.any():
+            x[own] = z * self.inverse[own][:, :, None]
+            x[-1] = 0.0
+            reduced -= self._scaled_transposed(self.lin.times(x[:-1], {"point"}), self._reduced_kinds)[order]
+            x[:] = 0.0
+        y = self.solve_reduced(reduced)
+        x[order] = y * self.inverse[order][:, None]
+        x[-1] = 0.0
+        coupled = self._scaled_transposed(self.lin.times(x[:-1], self._reduced_kinds), {"point"})
+        x[own] = (z - self._points(coupled[own])) * self.inverse[own][:, :, None]
+        return np.asarray(x[:-1].reshape(rhs.shape))
 
     @cached_property
-    def coupling(self) -> Any:
-        """Y of all points, (3 points, reduced unknowns), sparse by rows."""
-        size = len(self.kept)
-        values, columns, counts = [np.zeros(0)], [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
-        for b in self.batches:
-            values.append(b.y.ravel())
-            columns.append(np.broadcast_to(b.reduced[:, None, :], b.y.shape).ravel())
-            counts.append(np.full(3 * len(b.y), b.y.shape[2]))
-        starts = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
-        matrix = sparse.csr_array((np.concatenate(values), np.concatenate(columns), starts), shape=(len(starts) - 1, size + 1))
-        return matrix[:, :size]  # without the dummy column
+    def _reduced_kinds(self) -> set[str]:
+        """The unknown groups of the reduced system."""
+        kinds = {g.kind for g in self.lin.unknowns.groups}
+        retained = np.isin(self.structure.order, self.lin.unknowns["point"].columns[self.lin.unknowns["point"].columns >= 0]).any()
+        return kinds if retained else kinds - {"point"}
+
+    def _scaled_transposed(self, y: Floats, kinds: set[str]) -> Floats:
+        return np.append(self.lin.transposed(y, kinds), np.zeros((1, y.shape[1])), axis=0) * self.inverse[:, None]
+
+    def _points(self, rhs: Floats) -> Floats:
+        """Return (R'R)^-1 rhs for the (P, 3, k) scaled right-hand sides of the inner points."""
+        r, z = self.triangles, rhs.copy()
+        for i in range(3):
+            for j in range(i):
+                z[:, i] -= r[:, j, i, None] * z[:, j]
+            z[:, i] /= r[:, i, i, None]
+        for i in (2, 1, 0):
+            for j in range(i + 1, 3):
+                z[:, i] -= r[:, i, j, None] * z[:, j]
+            z[:, i] /= r[:, i, i, None]
+        return z
+
+    def solve_reduced(self, rhs: Floats) -> Floats:
+        """Return S^-1 rhs for (U, k) right-hand sides of the scaled reduced system in the order of elimination."""
+        x = np.ascontiguousarray(rhs)
+        for front, panel in zip(self.structure.fronts, self.panels, strict=True):
+            p = front.pivots
+            own = x[front.begin : front.begin + p]
+            lapack.solve_left(panel[:p], own)
+            x[front.columns[p:]] -= panel[p:] @ own
+        for front, panel in zip(reversed(self.structure.fronts), reversed(self.panels), strict=True):
+            p = front.pivots
+            own = x[front.begin : front.begin + p]
+            own -= panel[p:].T @ x[front.columns[p:]]
+            lapack.solve_left_transposed(panel[:p], own)
+        return x
 
     @cached_property
-    def _inverse(self) -> Floats:
-        n = len(self.kept)
-        out = np.zeros((n + 1, n + 1))
-        if n:
-            half = np.tril(linalg.lapack.dtrtri(self.factor, lower=1)[0])
-            out[:n, :n] = (half.T @ half) / np.outer(self.scale, self.scale)
-        return out
+    def rcond(self) -> float:
+        """Reciprocal condition number of the scaled reduced normal matrix, estimated in the 1-norm (Higham & Tisseur 2000)."""
+        n = self.count
+        if not n:
+            return 1.0
 
+        def product(x: Floats) -> Floats:
+            y = x.reshape(n, -1).copy()
+            for front, panel in zip(self.structure.fronts, self.panels, strict=True):  # y = L' x
+                p = front.pivots
+                own = np.tril(panel[:p]).T @ y[front.begin : front.begin + p]
+                y[front.begin : front.begin + p] = own + panel[p:].T @ y[front.columns[p:]]
+            for front, panel in zip(reversed(self.structure.fronts), reversed(self.panels), strict=True):  # L y
+                p = front.pivots
+                own = y[front.begin : front.begin + p].copy()
+                y[front.columns[p:]] += panel[p:] @ own
+                y[front.begin : front.begin + p] = np.tril(panel[:p]) @ own
+            return y
+
+        def solved(x: Floats) -> Floats:
+            return self.solve_reduced(x.reshape(n, -1).copy())
+
+        norms = [onenormest(LinearOperator((n, n), matvec=f, rmatvec=f, matmat=f, rmatmat=f, dtype=float)) for f in (product, solved)]
+        return float(1.0 / (norms[0] * norms[1]))
+
+    # ---- statistics ----
     def hat(self) -> list[Floats]:
         """Return for each chunk the (N, m, m) diagonal blocks of A N^-1 A'."""
-        z = self._inverse
-        out = [np.zeros((len(c.first), c.misclosure.shape[1], c.misclosure.shape[1])) for c in self.lin.chunks]
-        for at, where, jacobian in self.rest:
-            h = jacobian @ z[at[:, :, None], at[:, None, :]] @ jacobian.transpose(0, 2, 1)
-            _store(out, where, h)
-        chunk, row = self.ident
-        for b in self.batches:
-            p, k, m, w = b.gr.shape
-            local = z[b.reduced[:, :, None], b.reduced[:, None, :]]  # (P, kw, kw)
-            yz = b.y @ local
-            core = np.eye(3) + yz @ b.y.transpose(0, 2, 1)
-            own = np.arange(k)
-            diagonal = local.reshape(p, k, w, k, w)[:, own, :, own, :].transpose(1, 0, 2, 3)  # (P, k, w, w)
-            mixed = b.q1 @ yz.reshape(p, 3, k, w).transpose(0, 2, 1, 3) @ b.gr.transpose(0, 1, 3, 2)
-            h = b.q1 @ core[:, None] @ b.q1.transpose(0, 1, 3, 2) - mixed - mixed.transpose(0, 1, 3, 2)
-            h += b.gr @ diagonal @ b.gr.transpose(0, 1, 3, 2)
-            blocks = b.blocks.ravel()
-            _store(out, np.stack([chunk[blocks], row[blocks]], axis=1), h.reshape(p * k, m, m))
-        return out
+        return list(self._statistics[0])
 
     def blocks(self, columns: Ints) -> Floats:
-        """Return the (N, w, w) blocks of N^-1 for (N, w) columns: nodes of the reduced system, or whole points."""
-        z = self._inverse
+        """Return the (N, w, w) blocks of N^-1 for (N, w) columns: each of one node of the reduced system, or of one point."""
+        _, points, nodes = self._statistics
+        own = self.structure.point_columns
+        point, axis = np.full(len(self.inverse), -1), np.zeros(len(self.inverse), dtype=np.intp)
+        point[own] = np.arange(len(own))[:, None]
+        axis[own] = np.arange(3)
+        point[-1] = -1
+        where = point[columns].max(axis=1, initial=-1)
+        out = np.zeros((*columns.shape, columns.shape[1]))
+        inner = np.flatnonzero(where >= 0)
+        at, free = axis[columns[inner]], columns[inner] >= 0
+        found = points[where[inner][:, None, None], at[:, :, None], at[:, None, :]]
+        out[inner] = np.where(free[:, :, None] & free[:, None, :], found, 0.0)
+        outer = np.flatnonzero(where < 0)
+        out[outer] = nodes(columns[outer])
+        return out
+
+    @cached_property
+    def _statistics(self) -> tuple[list[Floats], Floats, Callable[[Ints], Floats]]:
+        structure, lin = self.structure, self.lin
+        hat = np.zeros(int(self.blocks_.hat[-1]))
+        points = np.zeros((len(structure.points), 3, 3))
+        own: list[Floats | None] = [None] * len(structure.fronts)
+        inverses: dict[int, Floats] = {}
+        left, lock = [len(f.children) for f in structure.fronts], threading.Lock()
+        rest: dict[int, list[tuple[int, Ints, Ints]]] = {}
+        for entry in structure.rest:
+            for f in np.unique(entry.front):
+                rest.setdefault(int(f), []).append((entry.chunk, entry.rows[entry.front == f], entry.at[entry.front == f]))
+
+        def invert(f: int) -> None:
+            front, panel = structure.fronts[f], self.panels[f]
+            n, p = len(front.columns), front.pivots
+            z = np.empty((n, n))
+            corner = panel[:p].copy()
+            if p < n:
+                outer = z[p:, p:]
+                self.loops.gather(inverses[front.parent], front.into_parent, outer)
+                g = panel[p:].copy()
+                lapack.solve_right(corner, g)
+                lapack.multiply(outer, g, z[p:, :p], -1.0)
+                z[:p, p:] = z[p:, :p].T
+            lapack.invert_from_cholesky(corner)
+            z[:p, :p] = np.tril(corner) + np.tril(corner, -1).T
+            if p < n:
+                lapack.multiply_transposed(g, z[p:, :p], z[:p, :p], -1.0, 1.0)
+                z[:p, :p] = 0.5 * (z[:p, :p] + z[:p, :p].T)
+            self.loops.statistics(front.clusters, z, self.blocks_, hat, points, self.size)
+            for chunk, rows, at in rest.get(f, ()):
+                self._rest_hat(z, chunk, rows, at, hat)
+            own[f] = z[:p, :p].copy()
+            if front.children:
+                inverses[f] = z
+            if front.parent >= 0:
+                with lock:
+                    left[front.parent] -= 1
+                    if left[front.parent] == 0:
+                        del inverses[front.parent]
+
+        fronts = structure.fronts
+        before = [int(f.parent >= 0) for f in reversed(fronts)]  # from the root to the leaves
+        run_tree(before, _children_backwards(fronts), lambda i: invert(len(fronts) - 1 - i), lin.workers)
+        self.loops.statistics(_orphans(structure), np.zeros((0, 0)), self.blocks_, hat, points, self.size)
+        for f, entries in rest.items():
+            if f < 0:
+                for chunk, rows, at in entries:
+                    self._rest_hat(np.zeros((0, 0)), chunk, rows, at, hat)
+        out = []
+        for k, c in enumerate(lin.chunks):
+            m = c.misclosure.shape[1]
+            out.append(hat[self.blocks_.hat[k] : self.blocks_.hat[k + 1]].reshape(-1, m, m))
+        return out, points, _NodeBlocks(structure, [z for z in own if z is not None], self.inverse)
+
+    def _rest_hat(self, z: Floats, chunk: int, rows: Ints, at: Ints, hat: Floats) -> None:
+        """Store the diagonal blocks of rows without inner point."""
+        c = self.lin.chunks[chunk]
+        h = _scaled(c, rows, self.inverse)
+        padded = np.zeros((len(z) + 1, len(z) + 1))
+        padded[:-1, :-1] = z
+        m = c.misclosure.shape[1]
+        values = h @ padded[at[:, :, None], at[:, None, :]] @ h.transpose(0, 2, 1)
+        hat[self.blocks_.hat[chunk] + rows[:, None] * (m * m) + np.arange(m * m)] = values.reshape(len(rows), -1)
+
+
+class _NodeBlocks:
+    """Blocks of the inverse whose columns are eliminated in one front."""
+
+    def __init__(self, structure: Structure, own: list[Floats], inverse: Floats) -> None:
+        self.own, self.fronts, self.inverse = own, structure.fronts, inverse
+        self.place = np.full(len(inverse), -1)
+        self.place[structure.order] = np.arange(len(structure.order))
+        self.place[-1] = -1
+        begins = np.array([f.begin for f in structure.fronts], dtype=np.intp)
+        self.begins = begins
+
+    def __call__(self, columns: Ints) -> Floats:
+        """Return (N, w, w) blocks; zero where a column is -1 or held."""
         at = self.place[columns]
-        out = np.asarray(z[at[:, :, None], at[:, None, :]])
-        if columns.shape[1] == 3 and len(columns):
-            position = np.full(self.lin.unknowns.count + 1, -1)
-            position[columns[:, 0]] = np.arange(len(columns))
-            position[-1] = -1
-            for b in self.batches:
-                where = position[b.columns[:, 0]]
-                some = np.flatnonzero(where >= 0)
-                if not len(some):
-                    continue
-                local = z[b.reduced[some][:, :, None], b.reduced[some][:, None, :]]
-                core = np.eye(3) + b.y[some] @ local @ b.y[some].transpose(0, 2, 1)
-                inverse = np.linalg.inv(b.r1[some])
-                out[where[some]] = inverse @ core @ inverse.transpose(0, 2, 1)
+        out = np.zeros((*columns.shape, columns.shape[1]))
+        front = np.searchsorted(self.begins, at.max(axis=1), side="right") - 1
+        for f in np.unique(front[at.max(axis=1) >= 0]):
+            rows = np.flatnonzero((front == f) & (at.max(axis=1) >= 0))
+            local = np.where(at[rows] >= 0, at[rows] - self.fronts[f].begin, 0)
+            weight = np.where(at[rows] >= 0, self.inverse[columns[rows]], 0.0)
+            out[rows] = self.own[f][local[:, :, None], local[:, None, :]] * weight[:, :, None] * weight[:, None, :]
         return out
 
 
-def eliminated_points(lin: Linearization, held: Ints) -> NDArray[np.bool_]:
-    """Return which points can be eliminated: three free coordinates, none held, and no observation to another point."""
-    columns = lin.unknowns["point"].columns.reshape(-1, 3)
-    out: NDArray[np.bool_] = np.asarray((columns >= 0).all(axis=1) & ~np.isin(columns, held).any(axis=1))
-    for c in lin.chunks:
-        ends = [p for p in c.parts if p.kind == "point"]
-        if len(ends) > 1:
-            for p in ends:
-                out[p.nodes] = False
-    seen = np.zeros(len(out), dtype=bool)
-    for c in lin.chunks:
-        for p in c.parts:
-            if p.kind == "point":
-                seen[p.nodes] = True
-    return np.asarray(out & seen)
+def _sizes(structure: Structure, arrays: Blocks) -> Ints:
+    """Return the sizes of the buffers: rows of a point, Y, the square of a cluster, touched parts of a point."""
+    width = np.diff(structure.first_column)
+    height = np.where(structure.sparse, 3, 3 * np.diff(structure.first_point))
+    most_rows = int(arrays.table[:, 0].max(initial=1))
+    most_parts = int(arrays.table[:, 1].max(initial=1))
+    rows = structure.most_rows
+    return np.array(
+        [rows * most_rows + 6, int((width * height).max(initial=1)), int((width**2).max(initial=1)), 2 * rows * most_parts + 2],
+        dtype=np.intp,
+    )
 
 
-def _row_blocks(
-    lin: Linearization, eliminated: NDArray[np.bool_], place: Ints
-) -> tuple[Ints, tuple[Ints, Ints], Ints, Floats, Floats, tuple[tuple[Ints, Ints, Floats], ...]]:
-    """Sort the row blocks: those of eliminated points, padded to common m and w, and the rest."""
-    pieces, rest = [], []
-    for i, c in enumerate(lin.chunks):
-        n = len(c.first)
-        at = np.concatenate([place[p.columns] for p in c.parts], axis=1)
-        jacobian = np.concatenate([p.jacobian for p in c.parts], axis=2)
-        point = next((p for p in c.parts if p.kind == "point"), None)
-        touched = eliminated[point.nodes] if point is not None else np.zeros(n, dtype=bool)
-        ident = np.stack([np.full(n, i), np.arange(n)], axis=1)
-        if (~touched).any():
-            rest.append((at[~touched], ident[~touched], jacobian[~touched]))
-        if point is not None and touched.any():
-            used = (at[touched] < len(place) - 1) & (at[touched] != place[-1])
-            columns = np.flatnonzero(used.any(axis=0))  # leaves out the point's own and fixed columns
-            pieces.append(
-                (point.nodes[touched], ident[touched], at[touched][:, columns], jacobian[touched][:, :, columns], point.jacobian[touched])
-            )
-    m = max((p[3].shape[1] for p in pieces), default=1)
-    w = max((p[3].shape[2] for p in pieces), default=0)
-    total = sum(len(p[0]) for p in pieces)
-    node, ident = np.empty(total, dtype=np.intp), np.empty((total, 2), dtype=np.intp)
-    reduced, gr, gp = np.full((total, w), place[-1]), np.zeros((total, m, w)), np.zeros((total, m, 3))
-    a = 0
-    for nodes, idents, at, jr, jp in pieces:
-        b = a + len(nodes)
-        node[a:b], ident[a:b], reduced[a:b, : at.shape[1]] = nodes, idents, at
-        gr[a:b, : jr.shape[1], : jr.shape[2]], gp[a:b, : jp.shape[1]] = jr, jp
-        a = b
-    return node, (ident[:, 0], ident[:, 1]), reduced, gr, gp, tuple(rest)
+def _orphans(structure: Structure) -> Ints:
+    """Return the clusters that touch no node."""
+    return np.flatnonzero(np.diff(structure.first_column) == 0)
 
 
-def _eliminate(blocks: Ints, columns: Ints, reduced: Ints, gr: Floats, gp: Floats, damping: float, lin: Linearization) -> Batch:
-    p, k = blocks.shape
-    m, w = gr.shape[1:]
-    own = gp[blocks].reshape(p, k * m, 3)
-    if damping:
-        extra = np.sqrt(damping) * lin.scale[columns][:, :, None] * np.eye(3)
-        q1, r1, bad = _orthogonal(np.concatenate([own, extra], axis=1))
-        q1 = q1[:, : k * m]
-    else:
-        q1, r1, bad = _orthogonal(own)
-    if bad.any():
-        names = [lin.unknowns.names[c] for c in columns[bad].ravel()]
-        count = int(bad.sum())
-        raise Singular(f"the rays do not determine {count} object point(s): {', '.join(names[:12])}", names)
-    q1 = np.ascontiguousarray(q1.reshape(p, k, m, 3))
-    rows = gr[blocks]
-    y = np.einsum("pkma,pkmw->pakw", q1, rows).reshape(p, 3, k * w)
-    return Batch(blocks, columns, reduced[blocks].reshape(p, k * w), rows, q1, r1, np.ascontiguousarray(y))
+def _after(front: Front) -> list[int]:
+    return [front.parent] if front.parent >= 0 else []
 
 
-def _orthogonal(a: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Factor (P, R, 3) arrays as Q R by modified Gram-Schmidt, done twice; also flag rank-deficient ones."""
-    q, r = a.copy(), np.broadcast_to(np.eye(3), (len(a), 3, 3)).copy()
-    norms = np.linalg.norm(a, axis=1)
-    bad = np.zeros(len(a), dtype=bool)
-    for sweep in range(2):
-        step = np.zeros((len(a), 3, 3))
-        for j in range(3):
-            for i in range(j):
-                step[:, i, j] = np.einsum("pr,pr->p", q[:, :, i], q[:, :, j])
-                q[:, :, j] -= step[:, i, j, None] * q[:, :, i]
-            length = np.linalg.norm(q[:, :, j], axis=1)
-            bad |= ~(length > 1e-12 * (norms[:, j] if sweep == 0 else 1.0))
-            step[:, j, j] = np.where(bad, 1.0, length)
-            q[:, :, j] /= step[:, j, j, None]
-        r = step @ r
-    return q, r, bad
+def _children_backwards(fronts: tuple[Front, ...]) -> list[list[int]]:
+    return [[len(fronts) - 1 - c for c in f.children] for f in reversed(fronts)]
 
 
-def _scatter(s: Floats, size: int, at: Ints, values: Floats) -> None:
-    """Add (N, w, w) blocks into the flat square matrix of `size` + 1."""
-    flat = at[:, :, None] * (size + 1) + at[:, None, :]
-    np.add.at(s, flat.ravel(), np.ascontiguousarray(values).ravel())
+def _scaled(c: Any, rows: Ints, inverse: Floats) -> Floats:
+    """Return the partials (N, m, w) of row blocks with scaled columns."""
+    return np.concatenate([p.jacobian[rows] * inverse[p.columns_of(rows)][:, None, :] for p in c.parts], axis=2)
 
 
-def _store(out: list[Floats], ident: Ints, values: Floats) -> None:
-    for i in np.unique(ident[:, 0]):
-        rows = ident[:, 0] == i
-        m = out[i].shape[1]
-        out[i][ident[rows, 1]] = values[rows, :m, :m]
+def _rest_by_front(lin: Linearization, structure: Structure, inverse: Floats) -> dict[int, list[tuple[Ints, Floats]]]:
+    out: dict[int, list[tuple[Ints, Floats]]] = {}
+    for entry in structure.rest:
+        h = _scaled(lin.chunks[entry.chunk], entry.rows, inverse)
+        order = np.argsort(entry.front, kind="stable")
+        fronts, first = np.unique(entry.front[order], return_index=True)
+        for f, some in zip(fronts, np.split(order, first[1:]), strict=True):
+            out.setdefault(int(f), []).append((entry.at[some], h[some]))
+    return out
+
+
+def _add_rows(matrix: Floats, at: Ints, jacobian: Floats) -> None:
+    """Add J'J of row blocks to the lower triangle of a front; column -1 is fixed."""
+    values = np.einsum("nmi,nmj->nij", jacobian, jacobian)
+    i, j = np.broadcast_to(at[:, :, None], values.shape), np.broadcast_to(at[:, None, :], values.shape)
+    used = (i >= j) & (j >= 0)
+    np.add.at(matrix, (i[used], j[used]), values[used])
+
+
+def _refuse_points(lin: Linearization, columns: Ints) -> None:
+    names = [lin.unknowns.name(int(c)) for c in columns[:4].ravel() if c >= 0]
+    raise Singular(f"the rays do not determine {len(columns)} object point(s): {', '.join(names[:12])}", names)
+
+
+def _refuse_nodes(
+    lin: Linearization, structure: Structure, inverse: Floats, arrays: Blocks, loops: Kernels, size: Ints, diagonal: Floats,
+    weakest: int, pivots: Floats, failed: bool,
+) -> None:  # fmt: skip
+    """Name the unknowns of a null space: of the whole reduced matrix where it is small enough, else of the front that shows it."""
+    n = len(structure.order)
+    if n > SEARCHED:
+        front = structure.fronts[weakest]
+        columns = structure.order[front.begin : front.begin + front.pivots]
+        refuse_null_space(np.tril(pivots) + np.tril(pivots, -1).T, columns, lin, failed)
+        return
+    matrix = np.zeros((n, n))
+    scratch, flags = np.zeros((len(structure.points), 3, 3)), np.zeros(len(structure.points), dtype=bool)
+    rest = _rest_by_front(lin, structure, inverse)
+    for f, front in enumerate(structure.fronts):
+        part = np.zeros((len(front.columns), len(front.columns)))
+        loops.accumulate(front.clusters, part, arrays, scratch, flags, size)
+        for at, jacobian in rest.get(f, ()):
+            _add_rows(part, at, jacobian)
+        matrix[np.ix_(front.columns, front.columns)] += part
+    matrix[np.arange(n), np.arange(n)] += diagonal
+    refuse_null_space(np.tril(matrix) + np.tril(matrix, -1).T, structure.order, lin, failed)

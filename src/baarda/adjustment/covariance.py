@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baarda.adjustment.datum import Datum
-from baarda.adjustment.kernels import Solver
+from baarda.adjustment.solver import Solver
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+
+AT_ONCE = 16_000_000  # doubles in the right-hand sides that are solved together
 
 
 @dataclass(frozen=True)
@@ -32,10 +34,15 @@ class Cofactors:
         b = a if b is None else b
         if len(b) > len(a):
             return self.of(b, a).T
-        unit = np.zeros((self.count, len(b)))
-        free = b >= 0
-        unit[b[free], np.flatnonzero(free)] = 1.0
-        return np.asarray(np.concatenate([self.solve(unit), np.zeros((1, len(b)))])[a])
+        out = np.zeros((len(a), len(b)))
+        step = max(1, AT_ONCE // max(self.count, 1))
+        for k in range(0, len(b), step):
+            some = b[k : k + step]
+            unit = np.zeros((self.count, len(some)))
+            free = some >= 0
+            unit[some[free], np.flatnonzero(free)] = 1.0
+            out[:, k : k + step] = np.where(a[:, None] >= 0, self.solve(unit)[a], 0.0)
+        return out
 
     @cached_property
     def _inner(self) -> tuple[Floats, Floats, Floats] | None:

@@ -67,6 +67,7 @@ def similarity_directions(unknowns: Unknowns, state: State) -> Floats:
         "camera": np.zeros((len(unknowns["camera"].columns), 7)),
         "image": np.concatenate([moved(state.position), turn], axis=1).reshape(-1, 7),
         "point": moved(state.points).reshape(-1, 7),
+        **{d.kind: d.similarity(size) for d in state.declared},
     }
     out = np.zeros((unknowns.count, 7))
     for group in unknowns.groups:
@@ -91,11 +92,10 @@ def find_defect(lin: Linearization, state: State, tolerance: float = 1e-18) -> D
     """
     g = similarity_directions(lin.unknowns, state)
     # Rows are brought to one size: what changes no observation does so whatever the weights are, and a weak observation must not drown.
-    square = lin.design.power(2)
-    size = square @ (g**2).sum(axis=1)
+    size = lin.row_sums((g**2).sum(axis=1))
     weight_of_row = np.divide(1.0, np.sqrt(size), out=np.zeros_like(size), where=size > 0.0)
-    image = weight_of_row[:, None] * (lin.design @ g)
-    gross = (g * (square.T @ weight_of_row**2)[:, None]).T @ g
+    image = weight_of_row[:, None] * lin.times(g)
+    gross = (g * lin.column_sums(weight_of_row**2)[:, None]).T @ g
     net = image.T @ image
     weight = np.sqrt(np.maximum(np.diag(gross), np.finfo(float).tiny))
     net, gross = net / np.outer(weight, weight), gross / np.outer(weight, weight)
@@ -105,6 +105,9 @@ def find_defect(lin: Linearization, state: State, tolerance: float = 1e-18) -> D
     sizes, directions = linalg.eigh(gross[np.ix_(present, present)])
     moving = sizes > 1e-10 * sizes[-1]  # other combinations of the seven move no unknown: fewer than seven unknowns can move
     whiten = directions[:, moving] / np.sqrt(sizes[moving])
+    reduced = whiten.T @ net[np.ix_(present, present)] @ whiten
+    if linalg.eigvalsh(reduced)[0] > 1e-8:
+        return Defect(np.zeros((len(g), 0)), ())
     triangle = np.linalg.qr(image[:, present] / weight[present] @ whiten, mode="r")
     _, values, vectors = np.linalg.svd(triangle)  # not from the product: its rounding would hide a weak observation
     small = np.append(values, np.zeros(len(vectors) - len(values))) <= np.sqrt(tolerance)

@@ -18,7 +18,7 @@ Ints = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class DenseSolver:
-    """A factored normal matrix; see `baarda.adjustment.kernels.Solver` for the contract."""
+    """A factored normal matrix; see `baarda.adjustment.solver.Solver` for the contract."""
 
     lin: Linearization
     kept: Ints
@@ -102,20 +102,40 @@ def factorise(matrix: Floats, columns: list[Ints], lin: Linearization) -> tuple[
         rcond, _ = linalg.lapack.dpocon(factor, np.abs(matrix).sum(axis=0).max(), uplo="L")
         if rcond > 1e-14:
             return factor, float(rcond)
+    else:
+        rcond = 0.0
+    refuse_null_space(matrix, np.concatenate(columns), lin, failed=info != 0)
+    return factor, float(rcond)
+
+
+def refuse_null_space(matrix: Floats, columns: Ints, lin: Linearization, failed: bool) -> None:
+    """Refuse a scaled normal matrix with a null space and name its unknowns.
+
+    Parameters
+    ----------
+    matrix : (k, k) array
+    columns : (k,) int array
+        The unknowns of the rows.
+    failed : bool
+        Whether it could not be factored; else a null space must show beyond rounding.
+
+    Raises
+    ------
+    Singular
+    """
     names = lin.unknowns.names
     values, vectors = linalg.eigh(matrix)
     limit = len(matrix) * np.finfo(float).eps * values[-1]
     null = vectors[:, values <= limit]
     if not null.shape[1]:
-        if info == 0:
-            return factor, float(rcond)
+        if not failed:
+            return
         null = vectors[:, :1]
-    at = np.concatenate(columns)
     share = (null**2).sum(axis=1)
     order = np.argsort(-share, kind="stable")
-    hit = [names[at[i]] for i in order if share[i] > 0.02 * share.max()]
+    hit = [names[columns[i]] for i in order if share[i] > 0.02 * share.max()]
     shown = ", ".join(hit[:12]) + (f" and {len(hit) - 12} more" if len(hit) > 12 else "")
-    rows = np.sqrt(lin.design.power(2) @ (1.0 / lin.scale**2))
+    rows = np.sqrt(lin.row_sums(1.0 / lin.scale**2))
     spread = rows.max() / rows[rows > 0.0].min()
     hint = f" (or the a-priori sigmas are too different: weighted observations differ by a factor of {spread:.0e})" if spread > 1e6 else ""
     raise Singular(f"the observations do not determine {len(null.T)} combination(s) of unknowns; involved: {shown}{hint}", hit)

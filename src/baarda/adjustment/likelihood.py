@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,13 +10,12 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from baarda.adjustment.datum import Datum
-from baarda.adjustment.kernels import Solver
-from baarda.adjustment.linearize import Linearization, linearize, whitened_misclosures
+from baarda.adjustment.linearize import Arrangement, Linearization, linearize, whitened_misclosures
 from baarda.adjustment.result import Iteration
+from baarda.adjustment.solver import Solver
 from baarda.distributions.base import Distribution
 from baarda.errors import UsageError
 from baarda.network import Network, State
-from baarda.observations import Kind
 
 if TYPE_CHECKING:
     from baarda.adjustment.solve import Settings
@@ -84,7 +82,7 @@ def iterate(
     network: Network,
     state: State,
     lin: Linearization,
-    groups: list[Kind],
+    groups: Arrangement,
     datum: Datum,
     factor: Factor,
     settings: Settings,
@@ -113,14 +111,14 @@ def iterate(
         slope = (law.score(u - reach) - law.score(u + reach)) / (2.0 * reach)
         size = np.maximum(np.abs(u), reach)
         curvature = np.maximum(slope, LEAST_CURVATURE * -law.score(size) / size)
-        solver = factor(_weighted(lin, np.sqrt(curvature)), datum, damping)
+        solver = factor(lin.weighted(np.sqrt(curvature)), datum, damping)
         psi = -law.score(u)
-        rhs = lin.design.T @ (psi * scale)
+        rhs = lin.transposed(psi * scale)
         step = solver.solve(rhs)
         if damping == 0.0:
             step = _newton_step(lin, solver, slope, u, psi, rhs, step, scale)
         step = datum.transform(step)
-        change = lin.design @ step
+        change = lin.times(step)
         relative = float(np.sqrt(change @ (curvature * change) / r) / scale)
         slope_along = float(step @ rhs) / scale**2
         length, accepted = 1.0, False
@@ -166,21 +164,21 @@ def _newton_step(
     The matrix is A' diag(psi') A - d d'/q, d = A'(u psi' + psi), q = sum(u psi + u^2 psi'); along a direction where it is
     not positive the step goes far, for the line search to shorten. Steihaug (1983), forcing term of Dembo, Eisenstat & Steihaug (1982).
     """
-    turn = lin.design.T @ (u * slope + psi)
+    turn = lin.transposed(u * slope + psi)
     share = float(u @ psi + (u * u) @ slope)
     rest, z = rhs, first
     direction, square = z, float(z @ rhs)
     accuracy = min(0.01, np.sqrt(square / (lin.count * max(float(np.mean(psi**2)), 1e-30)))) ** 2 * square
     step = np.zeros_like(first)
     for k in range(CG_STEPS):
-        image = lin.design.T @ (slope * (lin.design @ direction))
+        image = lin.transposed(slope * lin.times(direction))
         if share > 0.0:
             image = image - turn * (float(turn @ direction) / share)
         bend = float(direction @ image)
         if not bend > 1e-3 * square:
             if k == 0:
                 return first
-            return step + FAR * scale / float(np.abs(lin.design @ direction).max()) * direction
+            return step + FAR * scale / float(np.abs(lin.times(direction)).max()) * direction
         length = square / bend
         step = step + length * direction
         rest = rest - length * image
@@ -190,13 +188,3 @@ def _newton_step(
             break
         direction = z + (square / last) * direction
     return step
-
-
-def _weighted(lin: Linearization, roots: Floats) -> Linearization:
-    """Multiply the whitened rows by the roots of their weights."""
-    chunks = []
-    for c in lin.chunks:
-        w = roots[c.rows]
-        parts = tuple(replace(p, jacobian=np.ascontiguousarray(p.jacobian * w[:, :, None])) for p in c.parts)
-        chunks.append(replace(c, misclosure=c.misclosure * w, parts=parts))
-    return replace(lin, chunks=tuple(chunks))

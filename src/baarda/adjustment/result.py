@@ -14,13 +14,13 @@ from threadpoolctl import threadpool_limits
 from baarda.adjustment import tables
 from baarda.adjustment.covariance import Cofactors
 from baarda.adjustment.datum import Datum
-from baarda.adjustment.kernels import Solver
 from baarda.adjustment.linearize import Linearization, offsets_of
+from baarda.adjustment.solver import Solver
 from baarda.errors import UsageError
 from baarda.geometry import rotation as rot
 from baarda.hypotheses.base import Estimates, Evidence
 from baarda.network import AXES, CHECK, Network, State, Table, Unknowns
-from baarda.observations import CorrelatedPoints, Direct, ImagePoints, Kind
+from baarda.observations import CorrelatedPoints, Direct, ImageCoordinates, ImagePoints, Kind
 
 if TYPE_CHECKING:
     from baarda.adjustment.robust import LawOfErrors
@@ -136,7 +136,10 @@ class Adjustment:
         """v = adjusted - observed of all n observations, each in its unit."""
         out = np.empty(self.count)
         for c in self.lin.chunks:
-            out[c.rows] = -(c.factor @ c.misclosure[:, :, None])[:, :, 0]
+            if c.correlated:
+                out[c.rows] = -(c.factor @ c.misclosure[:, :, None])[:, :, 0]
+            else:
+                out[c.rows] = -np.einsum("nii->ni", c.factor) * c.misclosure
         return out
 
     @cached_property
@@ -151,6 +154,13 @@ class Adjustment:
         with threadpool_limits(limits=1, user_api="blas"):
             hats = self.solver.hat()
         for c, hat in zip(self.lin.chunks, hats, strict=True):
+            if not c.correlated:
+                sigma = np.einsum("nii->ni", c.factor)
+                share = 1.0 - np.einsum("nii->ni", hat)
+                found = (share * sigma**2, share, share / sigma**2, -c.misclosure / sigma, 1.0 / sigma**2)
+                for name, values in zip(("qvv", "redundancy", "pqvvp", "pv", "weight"), found, strict=True):
+                    out[name][c.rows] = values
+                continue
             rest = np.eye(hat.shape[1]) - hat
             inverse = np.linalg.inv(c.factor)
             left = c.factor @ rest
@@ -183,8 +193,8 @@ class Adjustment:
     def residuals_of(self, errors: Floats) -> Floats:
         """Map standardised errors (n, k), whitened and independent, to standardised residuals -Qvv P e, each divided by its sigma."""
         with threadpool_limits(limits=1, user_api="blas"):
-            white = self.lin.design @ self.solver.solve(self.lin.design.T @ errors) - errors
-        correlated = [c for c in self.lin.chunks if c.factor.shape[1] > 1 and np.any(np.tril(c.factor, -1))]
+            white = self.lin.times(self.solver.solve(self.lin.transposed(errors))) - errors
+        correlated = [c for c in self.lin.chunks if c.correlated]
         for c in correlated:
             values = np.einsum("nij,njk->nik", c.factor, white[c.rows])
             white[c.rows] = values / self.sigmas[c.rows][:, :, None]
@@ -388,7 +398,8 @@ class Adjustment:
         codes = self._codes()
         names = tuple(dict.fromkeys(codes["component"].tolist()))
         index = {name: i for i, name in enumerate(names)}
-        image_rows = np.concatenate([np.full(len(g) * len(g.components), isinstance(g, ImagePoints)) for g in self.groups])
+        kinds = (ImageCoordinates, ImagePoints)
+        image_rows = np.concatenate([np.full(len(g) * len(g.components), isinstance(g, kinds)) for g in self.groups])
         interior = self.camera_estimates
         additional = self._camera_estimates(additional_only=True)
         evidence = Evidence(

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from baarda.adjustment.datum import Datum
-from baarda.adjustment.kernels import Solver
 from baarda.adjustment.likelihood import iterate
-from baarda.adjustment.linearize import Linearization
+from baarda.adjustment.linearize import Arrangement, Linearization
 from baarda.adjustment.result import Iteration
+from baarda.adjustment.solver import Solver
 from baarda.distributions import law as find_law
 from baarda.distributions.base import Distribution
 from baarda.distributions.modulated import ModulatedNormal
@@ -27,7 +27,6 @@ from baarda.distributions.student import Student
 from baarda.errors import UsageError
 from baarda.hypotheses._error_kurtosis import a_of_kurtosis, kurtosis_of_errors
 from baarda.network import Network, State
-from baarda.observations import Kind
 
 if TYPE_CHECKING:
     from baarda.adjustment.solve import Settings
@@ -191,7 +190,7 @@ def adjust_under_law(
     network: Network,
     state: State,
     lin: Linearization,
-    groups: list[Kind],
+    groups: Arrangement,
     datum: Datum,
     factor: Factor,
     settings: Settings,
@@ -351,7 +350,7 @@ def excess_kurtosis_of_errors(lin: Linearization, solver: Solver, redundancy: in
         shares[chunk.rows] = 1.0 - np.einsum("nii->ni", hat)
 
     def residuals_of(e: Floats) -> Floats:
-        return np.asarray(e - lin.design @ solver.solve(lin.design.T @ e))
+        return np.asarray(e - lin.times(solver.solve(lin.transposed(e))))
 
     width = 64
     fourth = 0.0

@@ -10,15 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from baarda.adjustment.block import BlockSolver, eliminated_points
+from baarda.adjustment.block import BlockSolver
+from baarda.adjustment.camera_choice import with_cameras
 from baarda.adjustment.datum import Datum, Defect, find_defect, minimal_columns
 from baarda.adjustment.dense import DenseSolver
 from baarda.adjustment.initial import complete
-from baarda.adjustment.kernels import Solver
-from baarda.adjustment.linearize import Linearization, check_finite, linearize, whitened_misclosures
+from baarda.adjustment.linearize import Arrangement, Linearization, check_finite, linearize, whitened_misclosures
 from baarda.adjustment.result import Adjustment, Iteration
 from baarda.adjustment.robust import adjust_under_law, check_law
-from baarda.cameras import FIXED, FREE
+from baarda.adjustment.solver import Solver
+from baarda.adjustment.structure import analyse, inner_points, rank_of_points
+from baarda.cameras import FREE
 from baarda.errors import DatumDefect, RedundancyNotPositive, UsageError
 from baarda.network import CHECK, Network, State, Unknowns, unknowns_of
 from baarda.observations import ImagePoints, Kind, direct_observations
@@ -45,8 +47,9 @@ class Settings:
         Limit of the number of steps, rejected ones included.
     tolerance : float
         Converged when the step changes the adjusted observations by less than this part of the residuals (both weighted norms).
-    camera : tuple of str or None
-        Interior and additional parameters to estimate; None leaves the states of the source, ``()`` fixes all.
+    camera : str, tuple of str or None
+        Interior and additional parameters to estimate, or a preset: see `baarda.adjustment.camera_choice.with_cameras`. None leaves the
+        states of the source, ``()`` fixes all.
     image_sigma : float or None
         Replaces the a-priori sigma of all image points, pixels.
     residual_plane : {"image", "corrected"} or None
@@ -65,7 +68,7 @@ class Settings:
     min_rays: int = 2
     iterations: int = 50
     tolerance: float = 1e-10
-    camera: tuple[str, ...] | None = None
+    camera: tuple[str, ...] | str | None = None
     image_sigma: float | None = None
     residual_plane: str | None = None
     robust: str | None = None
@@ -139,7 +142,10 @@ def _adjust(network: Network, settings: Settings) -> Adjustment:
         raise UsageError("nothing to adjust: all unknowns are fixed")
 
     start = State.of(prepared)
-    lin = linearize(prepared, start, unknowns, groups)
+    kind = settings.solver if settings.solver != "auto" else "dense" if unknowns.count <= DENSE_LIMIT else "block"
+    rank = rank_of_points(start.points)
+    arranged = Arrangement.of(groups, rank if kind == "block" else None)
+    lin = linearize(prepared, start, unknowns, arranged)
     check_finite(lin, groups, prepared)
     defect = find_defect(lin, start)
     redundancy = lin.count - unknowns.count + defect.count
@@ -148,16 +154,18 @@ def _adjust(network: Network, settings: Settings) -> Adjustment:
             f"redundancy {redundancy}: n = {lin.count} observations, u = {unknowns.count} unknowns, "
             f"datum defect d = {defect.count}; a test needs r = n - u + d > 0"
         )
-    kind = settings.solver if settings.solver != "auto" else "dense" if unknowns.count <= DENSE_LIMIT else "block"
+    structure = analyse(lin, rank, start.points) if kind == "block" else None
 
     def factor(lin: Linearization, datum: Datum, damping: float = 0.0) -> Solver:
-        return (DenseSolver if kind == "dense" else BlockSolver).of(lin, datum.held, damping)
+        if structure is None:
+            return DenseSolver.of(lin, datum.held, damping)
+        return BlockSolver.of(lin, structure, datum.held, damping)
 
     datum = choose_datum(defect, lin, settings, prepared)
-    state, lin, history, converged = _iterate(prepared, start, lin, groups, datum, factor, settings)
+    state, lin, history, converged = _iterate(prepared, start, lin, arranged, datum, factor, settings)
     law = None
     if settings.robust is not None:
-        found = adjust_under_law(prepared, state, lin, groups, datum, factor, settings, redundancy, history)
+        found = adjust_under_law(prepared, state, lin, arranged, datum, factor, settings, redundancy, history)
         state, lin, history, converged, law = found
         more = [*more, *law.assumptions]
     datum = choose_datum(find_defect(lin, state) if defect.count else defect, lin, settings, prepared)
@@ -193,14 +201,7 @@ def prepare(network: Network, settings: Settings) -> tuple[Network, NDArray[np.b
     notes : list of str
         What was decided.
     """
-    notes: list[str] = []
-    cameras = network.cameras
-    if settings.camera is not None:
-        cameras = tuple(_with_free(c, settings.camera) for c in cameras)
-        known = {name for c in cameras for name in c.model.order}
-        unknown = [name for name in settings.camera if name not in known]
-        if unknown:
-            raise UsageError(f"no camera has a parameter {unknown[0]!r}; known are {', '.join(sorted(known))}")
+    network, notes = with_cameras(network, settings.camera)
     points = network.points
     states = np.array(points.states)
     states[points.roles == CHECK] = FREE
@@ -213,7 +214,7 @@ def prepare(network: Network, settings: Settings) -> tuple[Network, NDArray[np.b
             if settings.residual_plane is not None:
                 changed = replace(changed, residual_plane=settings.residual_plane)
         observations.append(changed)
-    network = replace(network, cameras=cameras, points=replace(points, states=states), observations=tuple(observations))
+    network = replace(network, points=replace(points, states=states), observations=tuple(observations))
 
     rays = np.zeros(len(points.labels), dtype=int)
     seen = np.zeros(len(network.images.labels), dtype=bool)
@@ -240,12 +241,6 @@ def prepare(network: Network, settings: Settings) -> tuple[Network, NDArray[np.b
         names = ", ".join(network.images.labels[i] for i in blind[:12])
         raise UsageError(f"{len(blind)} image(s) without image points: {names}")
     return network, aside, notes
-
-
-def _with_free(camera: Any, names: tuple[str, ...]) -> Any:
-    wanted = np.isin(camera.model.order, names)
-    states = np.where(wanted, np.where(camera.states == FIXED, FREE, camera.states), FIXED)
-    return replace(camera, states=states.astype(np.int8))
 
 
 def _say(notes: list[str], network: Network, which: NDArray[np.bool_], text: str) -> None:
@@ -285,13 +280,13 @@ def choose_datum(defect: Defect, lin: Linearization, settings: Settings, network
             f"the known values do not define the datum: free are {free} (datum defect {defect.count}); "
             "add control, or choose inner or minimal constraints (--datum inner)"
         )
-    eliminated = eliminated_points(lin, none)
-    inner_points = np.zeros(unknowns.count, dtype=bool)
+    eliminated = inner_points(lin)
+    early = np.zeros(unknowns.count + 1, dtype=bool)
     columns = unknowns["point"].columns.reshape(-1, 3)
-    inner_points[columns[eliminated].ravel()] = True
+    early[columns[eliminated].ravel()] = True
     images = unknowns["image"].columns
     held = none
-    for candidates in (images[images >= 0], np.flatnonzero(~inner_points), np.arange(unknowns.count)):
+    for candidates in (images[images >= 0], np.flatnonzero(~early[:-1]), np.arange(unknowns.count)):
         if len(candidates) >= defect.count and not len(held):
             held = minimal_columns(defect, lin, candidates)
     if len(held) < defect.count:
@@ -314,7 +309,7 @@ def _iterate(
     network: Network,
     state: State,
     lin: Linearization,
-    groups: list[Kind],
+    groups: Arrangement,
     datum: Datum,
     factor: Callable[..., Solver],
     settings: Settings,
@@ -334,14 +329,17 @@ def _iterate(
         values = whitened_misclosures(network, trial, groups)
         return trial, values, float(values @ values) if np.isfinite(values).all() else np.inf
 
+    tied = datum
+    untied = replace(datum, held=np.zeros(0, dtype=np.intp), conditions=None)  # damping ties the datum down by itself
     for count in range(1, settings.iterations + 1):
+        datum = untied if damping > 0.0 else tied
         solver = factor(lin, datum, damping)
-        rhs = lin.design.T @ lin.misclosure
+        rhs = lin.transposed(lin.misclosure)
         step = datum.transform(solver.solve(rhs))
-        change = lin.design @ step
+        change = lin.times(step)
         predicted = 2.0 * float(step @ rhs) - float(change @ change)
         relative = float(np.linalg.norm(change) / np.sqrt(max(objective, floor)))
-        if relative > BEND:
+        if relative > max(BEND, 0.1 * last if np.isfinite(last) else 0.0):  # steps that shrink fast need no bending
             step = _bent(lin, solver, datum, step, change, lambda x: misclosures(x)[1])
         trial, _, value = misclosures(step)
         gain = (objective - value) / predicted if predicted > 0.0 else 0.0
@@ -352,12 +350,12 @@ def _iterate(
             settings.progress(history[-1])
         if not accepted:
             curved |= relative < 1e-3  # large residuals bend the problem so much that full steps fail even beside the solution
-            damping, growth, last = max(damping * growth, 1e-7), 2.0 * growth, np.inf
+            damping, growth, last = max(damping * growth, 1e-4 if relative > 0.1 else 1e-7), 2.0 * growth, np.inf
             continue
         state, objective = trial, value
         lin = linearize(network, state, lin.unknowns, groups)
         settled = relative <= settings.tolerance or (relative <= 1e-7 and relative >= 0.5 * last)
-        if settled and (damping == 0.0 or _full_step(lin, datum, factor) <= 1e-6):
+        if settled and (damping == 0.0 or _full_step(lin, tied, factor) <= 1e-6):
             return state, lin, history, True
         damping *= max(0.5 if curved else 0.2, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
         if damping < 1e-9 or (relative < 1e-4 and not curved):
@@ -368,7 +366,7 @@ def _iterate(
 
 def _full_step(lin: Linearization, datum: Datum, factor: Callable[..., Solver]) -> float:
     """Return the relative step that would be taken without damping."""
-    change = lin.design @ factor(lin, datum).solve(lin.design.T @ lin.misclosure)
+    change = lin.times(factor(lin, datum).solve(lin.transposed(lin.misclosure)))
     return float(np.linalg.norm(change) / max(np.linalg.norm(lin.misclosure), 1e-4 * np.sqrt(lin.count)))
 
 
@@ -380,6 +378,6 @@ def _bent(
     curvature = 2.0 / h * ((lin.misclosure - misclosures(h * step)) / h - change)
     if not np.isfinite(curvature).all():
         return step
-    bend = -0.5 * datum.transform(solver.solve(lin.design.T @ curvature))
+    bend = -0.5 * datum.transform(solver.solve(lin.transposed(curvature)))
     size = np.linalg.norm(lin.scale * bend) / np.linalg.norm(lin.scale * step)
     return step + bend if size <= 0.375 else step

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from baarda.cameras import STATES
+from baarda.cameras import FREE, STATES
 from baarda.geometry import rotation as rot
 from baarda.network import AXES, ROLES, Network, Table
 from baarda.observations import ImagePoints
@@ -60,6 +60,18 @@ def unknown_table(a: Adjustment, sigma: Scaling) -> Table:
                     STATES[states[i, k]],
                 )
                 add(at[i, k], *row)
+    for declared, first_values in zip(net.declared, a.start.declared, strict=True):
+        group = numbering[declared.kind]
+        for width in np.unique(declared.widths).tolist():
+            nodes = np.flatnonzero(declared.widths == width)
+            at = group.of(nodes, width)
+            deviation = s0 * np.sqrt(np.einsum("nii->ni", a.cofactors.blocks(at)))
+            values, starts = declared.of(nodes, width), first_values.of(nodes, width)
+            for i, node in enumerate(nodes.tolist()):
+                for k in np.flatnonzero(at[i] >= 0).tolist():
+                    full = f"{declared.kind} {declared.labels[node]}: {group.parameters_of(node)[k]}"
+                    unit = declared.unit_of(node, k)
+                    add(at[i, k], full, declared.kind, unit, values[i, k], deviation[i, k], starts[i, k], STATES[FREE])
     arrays = {k: np.array(v, dtype=float if k in ("value", "sigma", "initial") else object) for k, v in columns.items()}
     return Table({k: v[np.argsort(order, kind="stable")] for k, v in arrays.items()})
 

@@ -48,12 +48,24 @@ class Step:
         ``xy (n, 2), p (n or 1, k) -> (out (n, 2), d_xy (n, 2, 2), d_p (n, 2, k))``.
     additional : bool
         Whether the parameters are additional ones (distortion, affinity) and not the interior orientation.
+    on_grid : bool
+        Whether the function is written in units of the grid half-width b of the camera, as the orthogonal sets are: it is called with
+        xy / b and parameters p / b^power, and its result is led back, so that its author sets b = 1.
     """
 
     name: str
     parameters: tuple[Parameter, ...]
     function: StepFunction
     additional: bool = False
+    on_grid: bool = False
+
+    def apply(self, xy: Floats, p: Floats, grid: float = 1.0) -> tuple[Floats, Floats, Floats]:
+        """Apply the function in plane units; `grid` is the half-width b that a step on a grid is written for."""
+        if not self.on_grid:
+            return self.function(xy, p)
+        units = grid ** np.array([q.power for q in self.parameters], dtype=float)
+        out, d_xy, d_p = self.function(xy / grid, p / units)
+        return out * grid, d_xy, d_p * (grid / units)
 
 
 def additive(increment: StepFunction) -> StepFunction:
@@ -112,6 +124,11 @@ class CameraModel:
         known = {p.name: s.additional for s in self.steps for p in s.parameters}
         return tuple(known[name] for name in self.order)
 
+    @cached_property
+    def on_grid(self) -> bool:
+        """Whether a step needs the grid half-width of the camera."""
+        return any(s.on_grid for s in self.steps)
+
     def columns(self, step: Step) -> list[int]:
         """Return the positions of a step's parameters in the model's order."""
         return [self.order.index(p.name) for p in step.parameters]
@@ -143,6 +160,8 @@ class Camera:
         Width and height in source pixels.
     given : (k,) array or None
         Directly observed values where they differ from `values` (after an adjustment); None = `values`.
+    grid : float or None
+        Half-width b of the grid on which a set of additional parameters is orthogonal, plane units; None = half the larger image side.
     """
 
     label: str
@@ -156,6 +175,24 @@ class Camera:
     y_down: bool = True
     image_size: tuple[float, float] | None = None
     given: Floats | None = None
+    grid: float | None = None
+
+    @property
+    def half_width(self) -> float:
+        """The grid half-width b in plane units, 1 where the model has no step on a grid.
+
+        Raises
+        ------
+        UsageError
+            If the model needs it and neither it nor the image size is known.
+        """
+        if not self.model.on_grid:
+            return 1.0
+        if self.grid is not None:
+            return float(self.grid)
+        if self.image_size is None:
+            raise UsageError(f"camera {self.label}: model {self.model.name} needs the image size, or the half-width of its grid")
+        return 0.5 * float(np.max(np.asarray(self.image_size, dtype=float) * np.asarray(self.pixel_size, dtype=float)))
 
     @property
     def prior(self) -> Floats:
@@ -167,6 +204,8 @@ class Camera:
         for name in ("values", "states", "sigmas"):
             if len(getattr(self, name)) != k:
                 raise UsageError(f"camera {self.label}: model {self.model.name} has {k} parameters, {name} has {len(getattr(self, name))}")
+        if self.grid is not None and not 0.0 < self.grid < np.inf:
+            raise UsageError(f"camera {self.label}: the half-width of the grid must be positive, not {self.grid}")
 
     def unit_of(self, k: int) -> str:
         """Return the unit of parameter k, for instance ``mm`` or ``mm^-2``; empty for a pure number."""
@@ -199,7 +238,7 @@ def create(
     observed : dict, optional
         A-priori standard deviation of each directly observed parameter.
     **constants
-        `unit`, `pixel_size`, `origin`, `y_down`, `image_size` of `Camera`.
+        `unit`, `pixel_size`, `origin`, `y_down`, `image_size`, `grid` of `Camera`.
 
     Raises
     ------
@@ -229,11 +268,13 @@ class Optics:
     pixel_size: Floats
     origin: Floats
     y_down: bool
+    grid: float = 1.0
 
     @staticmethod
     def of(camera: Camera) -> Optics:
         """Return the optics of a camera."""
-        return Optics(camera.model, np.asarray(camera.pixel_size, dtype=float), np.asarray(camera.origin, dtype=float), camera.y_down)
+        size, origin = np.asarray(camera.pixel_size, dtype=float), np.asarray(camera.origin, dtype=float)
+        return Optics(camera.model, size, origin, camera.y_down, camera.half_width)
 
     def _chain(self, steps: tuple[Step, ...], xy: Floats, p: Floats) -> tuple[Floats, Floats, Floats]:
         n, k = len(xy), p.shape[1]
@@ -242,7 +283,7 @@ class Optics:
             if step.name == "flip" and not self.y_down:
                 continue
             columns = self.model.columns(step)
-            xy, s_xy, s_p = step.function(xy, p[:, columns])
+            xy, s_xy, s_p = step.apply(xy, p[:, columns], self.grid)
             d_xy, d_p = s_xy @ d_xy, s_xy @ d_p
             if columns:
                 d_p[:, :, columns] += s_p

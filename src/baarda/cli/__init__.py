@@ -4,7 +4,7 @@ from importlib import import_module
 
 from baarda.cli.base import app
 
-for _verb in ("demo", "adjust", "residuals", "reproduce", "convert", "lists"):  # the order of the help
+for _verb in ("demo", "adjust", "residuals", "compare", "simulate", "reproduce", "convert", "lists"):  # the order of the help
     import_module(f"baarda.cli.{_verb}")
 
 

@@ -12,7 +12,11 @@ from baarda.cli.base import (
     Alpha,
     AlphaOutlier,
     CameraList,
+    Components,
+    ComponentsBy,
     Control,
+    CriterionB,
+    CrossValidate,
     DatumName,
     FormatName,
     ImageSigma,
@@ -24,8 +28,13 @@ from baarda.cli.base import (
     Quiet,
     Robust,
     Seed,
+    Select,
     SigmaName,
+    Snoop,
+    SnoopLaw,
+    SnoopUnit,
     Solver,
+    StrategyName,
     Strict,
     Tables,
     app,
@@ -48,6 +57,15 @@ def adjust(
     residual_plane: Plane = None,
     robust: Robust = None,
     min_rays: MinRays = None,
+    snoop: Snoop = False,
+    snoop_unit: SnoopUnit = "coordinate",
+    snoop_law: SnoopLaw = None,
+    select: Select = False,
+    criterion: CriterionB = "variance",
+    cross_validate: CrossValidate = None,
+    strategy: StrategyName = None,
+    variance_components: Components = False,
+    components_by: ComponentsBy = "group",
     alpha: Alpha = 0.05,
     alpha_outlier: AlphaOutlier = 0.001,
     power: Power = 0.80,
@@ -74,15 +92,18 @@ def adjust(
     }
     levels = {"alpha": alpha, "alpha_outlier": alpha_outlier, "power": power, "sigma": sigma, "seed": seed}
     target = None if as_json and out is None else out or Path("baarda-out")
-    adjust_and_report(network, settings, levels, target, tables, as_json, quiet, strict, started)
+    plan = {
+        "snoop": snoop_unit if snoop or snoop_unit != "coordinate" or snoop_law is not None else None,
+        "law": snoop_law,
+        "select": select,
+        "second": criterion,
+        "folds": cross_validate,
+        "strategy": strategy,
+    }
+    components = components_by if variance_components or components_by != "group" else None
+    adjust_and_report(network, settings, levels, target, tables, as_json, quiet, strict, started, plan, components)
 
 
-def camera_list(text: str, network: Any) -> tuple[str, ...] | None:
-    """Read --camera: None leaves the source's states."""
-    if text == "source":
-        return None
-    if text == "none":
-        return ()
-    if text == "all":
-        return tuple(dict.fromkeys(name for c in network.cameras for name in c.model.order))
-    return tuple(name.strip() for name in text.split(",") if name.strip())
+def camera_list(text: str, network: Any) -> str | tuple[str, ...] | None:
+    """Read --camera: None leaves what the source says, its settings included."""
+    return None if text == "source" else () if text == "none" else text

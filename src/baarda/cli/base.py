@@ -27,7 +27,12 @@ FormatName = Annotated[
     str | None, typer.Option("--format", help="Format of the source; by default recognised by content.", show_default=False)
 ]
 CameraList = Annotated[
-    str, typer.Option("--camera", help="Camera parameters to estimate: 'source', 'none', 'all', or a list such as principal_distance,K1.")
+    str,
+    typer.Option(
+        "--camera",
+        help="Camera parameters to estimate: source, none, all, a list such as principal_distance,K1, "
+        "or a preset: ebner12, fixed-brown+gruen44 (baarda cameras lists the models).",
+    ),
 ]
 ImageSigma = Annotated[
     float | None, typer.Option("--image-sigma", help="A-priori sigma of all image coordinates, pixels.", show_default=False)
@@ -37,6 +42,34 @@ Solver = Annotated[str, typer.Option("--solver", help="auto, dense or block.")]
 Robust = Annotated[
     str | None,
     typer.Option("--robust", help="Adjust by maximum likelihood under this law of errors (see: baarda laws).", show_default=False),
+]
+Snoop = Annotated[
+    bool, typer.Option("--snoop", help="Remove gross errors one by one and adjust again (with --robust: after a robust start).")
+]
+SnoopUnit = Annotated[str, typer.Option("--snoop-unit", help="What --snoop removes at once: coordinate, point (of an image) or image.")]
+SnoopLaw = Annotated[
+    str | None,
+    typer.Option("--snoop-law", help="Law of errors for the limits of --snoop, fitted to the residuals.", show_default="normal"),
+]
+Select = Annotated[bool, typer.Option("--select", help="Drop insignificant additional parameters one by one and adjust again.")]
+Components = Annotated[
+    bool, typer.Option("--variance-components", help="Estimate the variances of groups of observations first, and adjust with them.")
+]
+ComponentsBy = Annotated[
+    str, typer.Option("--components-by", help="One variance component per group of observations (group) or also per camera (camera).")
+]
+CriterionB = Annotated[
+    str,
+    typer.Option("--criterion", help="Criterion 9b of --select: variance (of s0^2), s, j, or trace (of the point covariances)."),
+]
+CrossValidate = Annotated[
+    int | None, typer.Option("--cross-validate", metavar="K", help="Withhold the control points in K turns.", show_default=False)
+]
+StrategyName = Annotated[
+    str | None,
+    typer.Option(
+        "--strategy", help="gruen: snooping, tests of all, single and paired parameters, deletion, control, check.", show_default=False
+    ),
 ]
 Plane = Annotated[str | None, typer.Option("--residual-plane", help="image or corrected.", show_default="source")]
 MinRays = Annotated[int | None, typer.Option("--min-rays", help="Set points with fewer rays aside.", show_default="source, else 2")]

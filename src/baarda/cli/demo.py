@@ -5,7 +5,23 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from baarda.cli.base import Alpha, AlphaOutlier, Json, Out, Power, Quiet, Seed, SigmaName, Solver, Strict, Tables, app, guarded
+from baarda.cli.base import (
+    Alpha,
+    AlphaOutlier,
+    Json,
+    Out,
+    Power,
+    Quiet,
+    Seed,
+    Select,
+    SigmaName,
+    Snoop,
+    Solver,
+    Strict,
+    Tables,
+    app,
+    guarded,
+)
 from baarda.cli.run import adjust_and_report
 
 
@@ -14,6 +30,8 @@ from baarda.cli.run import adjust_and_report
 def demo(
     out: Out = None,
     solver: Solver = "auto",
+    snoop: Snoop = False,
+    select: Select = False,
     alpha: Alpha = 0.05,
     alpha_outlier: AlphaOutlier = 0.001,
     power: Power = 0.80,
@@ -35,4 +53,5 @@ def demo(
         network = replace(read(folder / "camcaldemo.xml"), path="demo")
     levels = {"alpha": alpha, "alpha_outlier": alpha_outlier, "power": power, "sigma": sigma, "seed": seed}
     target = None if as_json and out is None else out or Path("demo-out")
-    adjust_and_report(network, {"solver": solver}, levels, target, tables, as_json, quiet, strict, started)
+    plan = {"snoop": "coordinate" if snoop else None, "select": select}
+    adjust_and_report(network, {"solver": solver}, levels, target, tables, as_json, quiet, strict, started, plan)

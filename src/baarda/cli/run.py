@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,14 @@ def adjust_and_report(
     quiet: bool,
     strict: bool,
     started: float,
+    plan: dict[str, Any] | None = None,
+    components: Any = None,
 ) -> None:
-    """Adjust a network, test it, write the result folder, print verdict or JSON, and leave with the exit code of the contract."""
+    """Adjust a network with the procedures of a plan, test it, write the folder, print verdict or JSON, leave with the exit code."""
     from baarda.adjustment import adjust as adjust_network
     from baarda.formats.folder import check_target
     from baarda.hypotheses.levels import Options
+    from baarda.procedures.strategy import Plan, carry_out
     from baarda.procedures.testing import analyse
     from baarda.report import page
     from baarda.report.result_folder import MARK, result_json, write_folder
@@ -44,10 +48,22 @@ def adjust_and_report(
         taken = "" if step.accepted else "  rejected"
         typer.echo(f"iteration {step.count:>2}  v'Pv {step.objective:.10g}{relative}{damping}{taken}", err=True)
 
-    result = adjust_network(network, **settings, progress=None if quiet else progress)
+    found = None
+    if components is not None:
+        from baarda.procedures.variance_components import estimate_components
+
+        tell = None if quiet else lambda text: typer.echo(text, err=True)
+        found, network = estimate_components(network, components, options, tell=tell, **settings)
+        settings = {**settings, "image_sigma": None}
+    strategy = None
+    chosen = Plan(**(plan or {}))
+    if chosen.empty:
+        result = adjust_network(network, **settings, progress=None if quiet else progress)
+    else:
+        result, strategy = carry_out(network, chosen, options, None if quiet else lambda text: typer.echo(text, err=True), **settings)
     if not quiet:
         typer.echo("testing and writing ...", err=True)
-    analysis = analyse(result, options)
+    analysis = replace(analyse(result, options), strategy=strategy, components=found)
     if out is not None:
         write_folder(analysis, out, tables, {"seconds": round(time.perf_counter() - started, 3)})
     if as_json:

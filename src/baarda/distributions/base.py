@@ -170,6 +170,11 @@ class Distribution:
         return tuple(out)
 
     @classmethod
+    def _log_and_score(cls, z: Floats, *shapes: Any) -> tuple[Floats, Floats]:
+        """`_logpdf` and `_score` together, where intermediate results can be shared."""
+        return cls._logpdf(z, *shapes), cls._score(z, *shapes)
+
+    @classmethod
     def _likelihood(cls, z: Floats, *shapes: Any) -> tuple[Floats, Floats, tuple[Floats, ...]]:
         """Log-density, its derivative by z and its derivatives by the shapes in one go: members override it where they share work."""
         return cls._logpdf(z, *shapes), cls._score(z, *shapes), cls._gradient(z, *shapes)

@@ -99,6 +99,31 @@ class Condensed:
         variance = np.where(self.counts == 1, 0.0, np.maximum(self.squares / n - high * high, 0.0))  # rounding can make it negative
         return np.ldexp(start + place, unit), np.ldexp(np.ldexp(variance, 2 * LOW_BITS), 2 * unit)
 
+    def ranges(self) -> tuple[Floats, Floats, Ints]:
+        """Return the lower and upper limits of the bins, ascending, as differences from `centre`, and the number of values in each.
+
+        Values on the limit away from the centre belong to the next bin.
+
+        Examples
+        --------
+        >>> lower, upper, counts = condense([-2.0, 1.0, 1.001, 3.0]).ranges()
+        >>> lower.tolist(), upper.tolist(), counts.tolist()
+        ([-2.03125, 1.0, 3.0], [-2.0, 1.015625, 3.03125], [1, 2, 1])
+        """
+        exponent = (self.keys >> BIN_BITS) & 0x7FF
+        start = ((exponent > 0).astype(np.int64) << 52) + ((self.keys & (PER_OCTAVE - 1)) << OFFSET_BITS)
+        unit = np.maximum(exponent, 1) - 1075
+        near, far = np.ldexp(start.astype(float), unit), np.ldexp((start + (1 << OFFSET_BITS)).astype(float), unit)
+        negative = self.keys >= _SIDE
+        lower, upper = np.where(negative, -far, near), np.where(negative, -near, far)
+        order = np.argsort(lower, kind="stable")
+        return lower[order], upper[order], self.counts[order]
+
+    def repeated(self) -> int:
+        """Return the number of values in bins all of whose values are equal (to 16 bits of their place), two at least."""
+        _, variance = self._bins()
+        return int(np.sum(self.counts[(variance == 0.0) & (self.counts > 1)]))
+
     def points(self, *, folded: bool = False, per_octave: int = PER_OCTAVE) -> tuple[Floats, Floats]:
         """Return points (differences from `centre`) and weights that stand for the values.
 

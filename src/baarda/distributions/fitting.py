@@ -133,7 +133,7 @@ def _fit_sample(
 
 
 def profile_interval(
-    values: ArrayLike,
+    values: ArrayLike | Condensed,
     law: str | Law = "modulated_normal",
     name: str = "a",
     *,
@@ -171,12 +171,16 @@ def profile_interval(
     inf
     """
     member = find_law(law) if isinstance(law, str) else law
-    x = check_values(values)
     given = given_values(member, loc, scale, shapes)
+    if isinstance(values, Condensed):
+        x: Floats | Condensed = values
+        sample = Sample.of_condensed(values)
+    else:
+        x = check_values(values)
+        sample = Sample.of(x, given.get("loc", float(np.mean(x))))
     found = fit(x, member, loc=loc, scale=scale, shapes=shapes, lower_a=lower_a)
     if name not in found.estimated or name not in {s.name for s in member.free_shapes}:
         raise UsageError(f"{name} is not an estimated shape of {member.name}")
-    sample = Sample.of(x, given.get("loc", float(np.mean(x))))
     full = problem_of(member, sample, given, found.estimated, lower_a)
     shape = full.shapes()[name]
     i = full.free.index(name)

@@ -72,6 +72,13 @@ class ModulatedNormal(Distribution):
         return (_with_normal_limit(_gradient, lambda x: np.zeros_like(x), z, shapes[0]),)
 
     @classmethod
+    def _log_and_score(cls, z: Floats, *shapes: Any) -> tuple[Floats, Floats]:
+        a = np.asarray(shapes[0], dtype=float)
+        if np.any(a >= _NORMAL_FROM):
+            return super()._log_and_score(z, a)
+        return _log_and_score(np.asarray(z, dtype=float), a)[:2]
+
+    @classmethod
     def _likelihood(cls, z: Floats, *shapes: Any) -> tuple[Floats, Floats, tuple[Floats, ...]]:
         a = np.asarray(shapes[0], dtype=float)
         if np.any(a >= _NORMAL_FROM):
@@ -190,12 +197,18 @@ def _gradient_of(z: Floats, a: Floats, e: Floats, score: Floats, slope: Floats) 
     return (1.0 + 0.5 * (1.0 + z * score) / (a + 2.0)) / (a + 1.0) + along
 
 
-def _likelihood(z: Floats, a: Floats) -> tuple[Floats, Floats, tuple[Floats, ...]]:
+def _log_and_score(z: Floats, a: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Return log f, the score, and what they were made of: E_(a+3/2), c and log c."""
     c, _, log_c = _argument(z, a)
     e = scaled_expint(a + 1.5, c, log_c)
     score = _score_of(z, a, e, scaled_expint(a + 0.5, c, log_c))
     with np.errstate(divide="ignore"):
         log_f = np.log(_factor(a)) + np.log(e) - c
+    return log_f, score, e, c, log_c
+
+
+def _likelihood(z: Floats, a: Floats) -> tuple[Floats, Floats, tuple[Floats, ...]]:
+    log_f, score, e, c, log_c = _log_and_score(z, a)
     return log_f, score, (_gradient_of(z, a, e, score, order_derivative(a + 1.5, c, log_c)),)
 
 

@@ -38,7 +38,7 @@ def refit_columns(member: Law, x: Floats, start: Distribution, given: Mapping[st
     Notes
     -----
     Fisher scoring with the information matrix at the start, halved steps where the likelihood falls, and projection on the bounds;
-    it stops at a hundredth of a standard error. Shapes that are expensive to vary are taken from a grid of 0.03 standard errors.
+    it stops at a hundredth of a standard error. Shapes that are expensive to vary are taken from a grid of 0.1 standard errors.
 
     Examples
     --------
@@ -80,6 +80,16 @@ def columnwise(function: Callable[..., Any], cls: type[Distribution], z: Floats,
             out = _empty_like(part, z.shape)
         _put(out, columns, part)
     return out
+
+
+def both_areas(cls: type[Distribution], z: Floats, shapes: tuple[Floats, ...]) -> tuple[Floats, Floats]:
+    """Return F(z) and 1 - F(z) of columns; for a symmetric law one tail area gives both."""
+    if not cls.symmetric:
+        return columnwise(cls._cdf, cls, z, shapes), columnwise(cls._sf, cls, z, shapes)
+    tail = np.asarray(columnwise(cls._sf, cls, np.abs(z), shapes))
+    rest = 1.0 - tail
+    above = z > 0.0
+    return np.where(above, rest, tail), np.where(above, tail, rest)
 
 
 def _empty_like(part: Any, shape: tuple[int, ...]) -> Any:
@@ -126,8 +136,13 @@ def _scoring(member: Law, x: Floats, values: dict[str, Floats], free: tuple[str,
         v = expand(t)
         cls = member.distribution
         z = (x[:, columns] - v["loc"]) / v["scale"]
-        log_f, score, slopes = columnwise(cls._likelihood, cls, z, tuple(v[s.name] for s in cls.shapes))
-        by_name = dict(zip((s.name for s in cls.shapes), slopes, strict=True))
+        own = tuple(v[s.name] for s in cls.shapes)
+        if shapes.keys().isdisjoint(free):
+            log_f, score = columnwise(cls._log_and_score, cls, z, own)
+            by_name = {}
+        else:
+            log_f, score, slopes = columnwise(cls._likelihood, cls, z, own)
+            by_name = dict(zip((s.name for s in cls.shapes), slopes, strict=True))
         terms = []
         for i, name in enumerate(free):
             if name == "loc":
@@ -142,7 +157,7 @@ def _scoring(member: Law, x: Floats, values: dict[str, Floats], free: tuple[str,
 
     value, gradient, information = evaluate(theta, slice(None))
     errors = np.sqrt(np.diag(np.linalg.inv(information)) / n)
-    grid = {i: 0.03 * errors[i] for i, name in enumerate(free) if name in shapes and member.distribution.by_shape}
+    grid = {i: 0.1 * errors[i] for i, name in enumerate(free) if name in shapes and member.distribution.by_shape}
     active = np.arange(replicas)
     shrink = np.ones(replicas)
     for _ in range(_ROUNDS):

@@ -59,7 +59,8 @@ def read(path: str | Path, format: str | None = None, control: str | Path | None
     format : str, optional
         Name of the format; by default it is recognised by content.
     control : str or Path, optional
-        A table of control and check points that replaces what the source says of them, see `baarda.formats.control`.
+        A table of control and check points that replaces what the source says of them, see `baarda.formats.control`, or a list of
+        control points with their image marks, see `baarda.formats.odm_gcp`.
 
     Returns
     -------
@@ -85,8 +86,9 @@ def read(path: str | Path, format: str | None = None, control: str | Path | None
     network = replace(network, path=str(path), format=chosen.name, sha256=digest(where))
     if control is not None:
         from baarda.formats.control import with_control
+        from baarda.formats.odm_gcp import is_gcp_list, with_gcp_list
 
-        network = with_control(network, Path(control))
+        network = (with_gcp_list if is_gcp_list(Path(control)) else with_control)(network, Path(control))
     return network
 
 

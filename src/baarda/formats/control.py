@@ -69,7 +69,7 @@ def with_control(network: Network, path: Path) -> Network:
 
     points = _replaced(network.points, given, rows, at, network.offset)
     if network.unit == checks.MODEL_UNITS:
-        network, points = _carried_over(network, points, path, notes)
+        network, points = carried_over(network, points, path, notes)
     else:
         checks.control_unit(points, network.unit, error, network.images.position)
     known = np.isfinite(points.given) & (points.roles == CONTROL)[:, None]
@@ -103,7 +103,7 @@ def _replaced(points: Points, given: Points, rows: NDArray[np.intp], at: NDArray
     )
 
 
-def _carried_over(network: Network, points: Points, path: Path, notes: list[str]) -> tuple[Network, Points]:
+def carried_over(network: Network, points: Points, path: Path, notes: list[str]) -> tuple[Network, Points]:
     """Carry start values in model units over to the system of the control points."""
     if (network.images.states != FREE).any() or any(hasattr(g, "starts") for g in network.observations):
         raise InputError("control cannot be joined with distances or known orientations that are in model units", path)

@@ -8,29 +8,31 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from baarda import cameras as camera_models
-from baarda.cameras import FIXED, FREE, OBSERVED, STATES, Camera
-from baarda.errors import InputError
+from baarda.cameras import FIXED, FREE, OBSERVED, STATES, Camera, CameraModel
+from baarda.errors import InputError, UsageError
 from baarda.formats import checks
 from baarda.formats.base import Format
 from baarda.formats.csv_table import CsvTable, read_csv
 from baarda.formats.known_values import columns_of, known_values, with_unknowns
 from baarda.formats.project_file import DEFAULT_NAMES, FILE, KINDS, TABLES, GroupTable, Header, read_header, settings_of
+from baarda.formats.project_kinds import DECLARED_COLUMNS, KIND_TABLES, read_declared
 from baarda.formats.project_writer import CORRELATIONS, MATRIX, write
 from baarda.geometry import rotation as rot
-from baarda.network import AXES, CHECK, CONTROL, EXTERIOR, ROLES, TIE, Images, Network, Points
-from baarda.observations import Distances, ImagePoints
+from baarda.network import AXES, CHECK, CONTROL, EXTERIOR, ROLES, TIE, Declared, Images, Network, Points
+from baarda.observations import Distances, ImageCoordinates, ImagePoints
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
 __all__ = ["points_of", "project", "read", "recognises", "write"]
 
-_CAMERA = ("unit", "pixel_size_x", "pixel_size_y", "origin_x", "origin_y", "y_down", "width", "height")
+_CAMERA = ("unit", "pixel_size_x", "pixel_size_y", "origin_x", "origin_y", "y_down", "width", "height", "grid_half_width")
 
 
 def recognises(path: Path) -> bool:
@@ -72,11 +74,12 @@ def read(path: Path) -> Network:
     if not any(kind in tables for kind in KINDS):
         raise InputError(f"no table of observations; known are {', '.join(KINDS)}", file)
     notes: list[str] = []
-    cameras = _read_cameras(tables, notes) if "cameras" in tables else ()
+    cameras = _read_cameras(tables, header, notes) if "cameras" in tables else ()
     images, image_lines = _read_images(tables["images"], cameras) if "images" in tables else (Images.make(()), None)
     points, point_lines = _read_points(tables["points"], notes)
     checks.control_unit(points, header.unit, point_lines.error, images.position)
-    observations = _read_observations(tables, header, images, points, notes)
+    declared = read_declared(read_csv(tables["declared"], *DECLARED_COLUMNS)) if "declared" in tables else ()
+    observations = _read_observations(tables, header, images, points, notes, declared)
     network = Network(
         cameras,
         images,
@@ -87,17 +90,18 @@ def read(path: Path) -> Network:
         offset=np.array(header.offset, dtype=float),
         settings=settings_of(header),
         assumptions=(*header.assumptions, *notes),
+        declared=declared,
     )
     if "unknowns" in tables:
         network = with_unknowns(network, read_csv(tables["unknowns"], ("name", "sigma"), ("value",)))
     if image_lines is not None:
-        seen = [g.images for g in observations if isinstance(g, ImagePoints)]
+        seen = [g.images for g in observations if isinstance(g, (ImageCoordinates, ImagePoints))]
         needed = (network.images.states == FREE).any(axis=1)
         checks.images_with_points(np.concatenate([np.zeros(0, dtype=np.intp), *seen]), images.labels, needed, image_lines.error)
     return network
 
 
-def _read_cameras(tables: Mapping[str, Path], notes: list[str]) -> tuple[Camera, ...]:
+def _read_cameras(tables: Mapping[str, Path], header: Header, notes: list[str]) -> tuple[Camera, ...]:
     table = read_csv(tables["cameras"], ("camera", "model"), _CAMERA)
     index = table.labels("camera", "camera")
     size = np.stack([table.numbers(f"pixel_size_{a}", 1.0) for a in "xy"], axis=1)
@@ -105,15 +109,24 @@ def _read_cameras(tables: Mapping[str, Path], notes: list[str]) -> tuple[Camera,
     image = np.stack([table.numbers("width"), table.numbers("height")], axis=1)
     y_down = table.choices("y_down", ("false", "true"))
     units = table.choices("unit", ("px", "mm"))
-    known = camera_models.models()
+    own = [t.model() for t in header.camera_sets]
+    known: dict[str, CameraModel] = {}
+    grid = table.numbers("grid_half_width")
     out = []
     for i, (label, model) in enumerate(zip(index, table.texts("model"), strict=True)):
         if model not in known:
-            raise table.error(i, f"unknown camera model {model!r}; known are {', '.join(known)}")
+            try:
+                known[model] = camera_models.model(model, own)
+            except UsageError as error:
+                raise table.error(i, str(error)) from None
         if not (size[i] > 0.0).all():
             raise table.error(i, "the pixel size must be positive")
         if np.isnan(image[i]).sum() == 1 or (image[i] <= 0.0).any():
             raise table.error(i, "width and height must both be there and positive, or both be left out")
+        if grid[i] <= 0.0:
+            raise table.error(i, "grid_half_width must be positive")
+        if known[model].on_grid and np.isnan(image[i, 0]) and np.isnan(grid[i]):
+            raise table.error(i, f"camera model {model} needs width and height, or grid_half_width")
         out.append(
             camera_models.create(
                 label,
@@ -124,6 +137,7 @@ def _read_cameras(tables: Mapping[str, Path], notes: list[str]) -> tuple[Camera,
                 origin=origin[i],
                 y_down=bool(y_down[i]),  # -1 = nothing said = true
                 image_size=None if np.isnan(image[i, 0]) else (float(image[i, 0]), float(image[i, 1])),
+                grid=None if np.isnan(grid[i]) else float(grid[i]),
             )
         )
     if "camera_parameters" not in tables:
@@ -260,10 +274,11 @@ def _refuse(table: CsvTable, bad: NDArray[np.bool_], message: str) -> None:
 
 
 def _read_observations(
-    tables: Mapping[str, Path], header: Header, images: Images, points: Points, notes: list[str]
-) -> tuple[ImagePoints | Distances, ...]:
-    found: dict[str, ImagePoints | Distances] = {}
-    for kind, columns in _OBSERVATIONS.items():
+    tables: Mapping[str, Path], header: Header, images: Images, points: Points, notes: list[str], declared: tuple[Declared, ...]
+) -> tuple[Any, ...]:
+    found: dict[str, Any] = {}
+    singles: dict[str, ImageCoordinates] = {}
+    for kind, columns in {**_OBSERVATIONS, **{t.kind: t.columns for t in KIND_TABLES.values()}}.items():
         groups = {g.name: g for g in header.groups if g.kind == kind}
         table = read_csv(tables[kind], *columns) if kind in tables else None
         names = [] if table is None else table.texts("group", DEFAULT_NAMES[kind])
@@ -274,25 +289,37 @@ def _read_observations(
             raise table.error(wrong, f"group {names[wrong]!r} of {kind} is not declared in {FILE}")
         code = np.array([index[name] for name in names], dtype=np.intp)
         usual = np.array([np.nan if g.sigma is None else g.sigma for g in groups.values()])[code]
-        everything = _READERS[kind](table, usual, images, points, header.unit, notes)
+        if kind in KIND_TABLES:
+            everything = KIND_TABLES[kind].read(table, usual, points, header.unit, declared)
+        else:
+            everything = _READERS[kind](table, usual, images, points, header.unit, notes)
         for i, group in enumerate(groups.values()):
             if group.name in found:
                 raise InputError(f"two groups of observations are called {group.name!r}", tables[kind])
             rows = np.flatnonzero(code == i)
             found[group.name] = _group(everything.selected(rows), group, table, rows, points, header.unit)
+            if table is not None and kind == "image_points":
+                singles.update(_single(found, group.name, table.choices("used", ("xy", "x", "y"))[rows]))
     order = dict.fromkeys([*(g.name for g in header.groups), *found])
-    return tuple(found[name] for name in order)
+    return tuple(g for name in order for g in (found[name], singles.get(name)) if g is not None)
+
+
+def _single(found: dict[str, Any], name: str, used: Ints) -> dict[str, ImageCoordinates]:
+    """Take the image points out of a group of which one coordinate was rejected; return the other coordinates."""
+    group, one = found[name], used > 0
+    if not one.any() or not isinstance(group, ImagePoints):
+        return {}
+    found[name] = group.selected(~one)
+    return {name: ImageCoordinates(group.selected(one), used[one] - 1)}
 
 
 _OBSERVATIONS = {
-    "image_points": (("image", "point", "x", "y"), ("group", "sigma_x", "sigma_y", "correlation")),
+    "image_points": (("image", "point", "x", "y"), ("group", "sigma_x", "sigma_y", "correlation", "used")),
     "distances": (("from", "to", "value"), ("group", "sigma")),
 }
 
 
-def _group(
-    found: ImagePoints | Distances, group: GroupTable, table: CsvTable | None, rows: Ints, points: Points, unit: str
-) -> ImagePoints | Distances:
+def _group(found: Any, group: GroupTable, table: CsvTable | None, rows: Ints, points: Points, unit: str) -> Any:
     """Return the rows of one group with what the header says of it, checked."""
 
     def error(row: int, message: str) -> InputError:
@@ -300,6 +327,8 @@ def _group(
 
     if isinstance(found, Distances):
         checks.distance_unit(found, points, unit, error)
+        return replace(found, name=group.name)
+    if not isinstance(found, ImagePoints):
         return replace(found, name=group.name)
     if not group.repeated:
         checks.measured_once(found.images, found.points, points.labels, error, lambda row: table.line(int(rows[row])) if table else 0)

@@ -6,22 +6,27 @@ import json
 import math
 import re
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from baarda.cameras import CameraModel
+from baarda.cameras.own_sets import Term, own_set, terms_of
 from baarda.errors import InputError, UsageError
 from baarda.formats.base import label_problem, read_text
 from baarda.formats.checks import SIGMAS
+from baarda.formats.project_kinds import KIND_TABLES
 
 SCHEMA = "baarda.project/1"
 FILE = "project.toml"
 LARGEST = 4 * 1024**2  # bytes of a header
-TABLES = ("cameras", "camera_parameters", "images", "points", "image_points", "distances", "unknowns")
-KINDS = ("image_points", "distances")
-DEFAULT_NAMES = {"image_points": "image points", "distances": "distances"}
+KINDS = ("image_points", "distances", *KIND_TABLES)
+TABLES = ("cameras", "camera_parameters", "images", "points", *KINDS, "declared", "unknowns")
+SETS = "camera_sets"  # key of the settings of a network under which its own sets are kept
+DEFAULT_NAMES = {kind: kind.replace("_", " ") for kind in KINDS}
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Sigma = Annotated[float, Field(ge=SIGMAS[0], le=SIGMAS[1], allow_inf_nan=False)]
@@ -57,7 +62,7 @@ class GroupTable(_Strict):
     """A group of observations: what its rows have in common."""
 
     name: Annotated[str, Field(min_length=1)]
-    kind: Literal["image_points", "distances"] = "image_points"
+    kind: Literal["image_points", "distances", "directions", "angles", "height_differences"] = "image_points"
     sigma: Sigma | None = None
     residual_plane: Plane | None = None
     repeated: bool = False
@@ -77,6 +82,44 @@ class GroupTable(_Strict):
         return self
 
 
+class TermTable(_Strict):
+    """A parameter of an own set: what it adds to x and y, as lists of [coefficient, exponent of x, exponent of y]."""
+
+    name: Annotated[str, Field(min_length=1)]
+    x: tuple[tuple[Finite, int, int], ...] = ()
+    y: tuple[tuple[Finite, int, int], ...] = ()
+
+    @field_validator("x", "y", mode="before")
+    @classmethod
+    def _as_tuples(cls, value: Any) -> Any:
+        return tuple(tuple(v) if isinstance(v, list) else v for v in value) if isinstance(value, list) else value
+
+
+class CameraSetTable(_Strict):
+    """A set of additional parameters of one's own; lengths are in units of the grid half-width."""
+
+    name: Annotated[str, Field(min_length=1)]
+    description: str = ""
+    terms: tuple[TermTable, ...]
+
+    @field_validator("terms", mode="before")
+    @classmethod
+    def _as_tuple(cls, value: Any) -> Any:
+        return tuple(value) if isinstance(value, list) else value
+
+    @model_validator(mode="after")
+    def _makes_a_model(self) -> CameraSetTable:
+        try:
+            self.model()
+        except UsageError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    def model(self) -> CameraModel:
+        """Return the camera model of the set."""
+        return own_set(self.name, [Term(t.name, t.x, t.y) for t in self.terms], self.description)
+
+
 class Header(_Strict):
     """The content of `project.toml`."""
 
@@ -88,8 +131,9 @@ class Header(_Strict):
     settings: SettingsTable = SettingsTable()
     tables: dict[str, str] | None = None
     groups: tuple[GroupTable, ...] = ()
+    camera_sets: tuple[CameraSetTable, ...] = ()
 
-    @field_validator("offset", "assumptions", "groups", mode="before")
+    @field_validator("offset", "assumptions", "groups", "camera_sets", mode="before")
     @classmethod
     def _as_tuple(cls, value: Any) -> Any:
         return tuple(value) if isinstance(value, list) else value
@@ -105,13 +149,13 @@ class Header(_Strict):
                 raise ValueError(f"{kind} = {name!r} must be the plain name of a .csv file in the folder of the project")
         return value
 
-    @field_validator("groups")
+    @field_validator("groups", "camera_sets")
     @classmethod
-    def _different_names(cls, value: tuple[GroupTable, ...]) -> tuple[GroupTable, ...]:
+    def _different_names(cls, value: tuple[Any, ...]) -> tuple[Any, ...]:
         names = [g.name for g in value]
         for name in names:
             if names.count(name) > 1:
-                raise ValueError(f"group {name!r} appears twice")
+                raise ValueError(f"{'group' if isinstance(value[0], GroupTable) else 'set'} {name!r} appears twice")
         return value
 
 
@@ -221,6 +265,7 @@ def header_text(
     settings: dict[str, Any],
     tables: dict[str, str],
     groups: list[dict[str, Any]],
+    sets: Sequence[CameraModel] = (),
 ) -> str:
     """Return the text of `project.toml`; settings that the format does not know go to `[settings.source]`."""
     known = [k for k in SettingsTable.model_fields if k != "source"]
@@ -236,6 +281,13 @@ def header_text(
             lines += ["", f"[{title}]", *(f"{_key(k)} = {toml_value(v, k)}" for k, v in content.items())]
     for group in groups:
         lines += ["", "[[groups]]", *(f"{k} = {toml_value(v, k)}" for k, v in group.items())]
+    for model in sets:
+        lines += ["", "[[camera_sets]]", f"name = {toml_value(model.name, 'name')}"]
+        lines += [f"description = {toml_value(model.description, 'description')}", "terms = ["]
+        for term in terms_of(model)[model.name]:
+            axes = [f", {axis} = {toml_value(m, axis)}" for axis, m in (("x", term.x), ("y", term.y)) if m]
+            lines.append(f"  {{ name = {toml_value(term.name, 'name')}{''.join(axes)} }},")
+        lines.append("]")
     return "\n".join(lines) + "\n"
 
 
@@ -246,7 +298,8 @@ def _key(name: str) -> str:
 def settings_of(header: Header) -> dict[str, Any]:
     """Return the settings of a project as a network keeps them, those of a foreign source beside our own."""
     own = {k: v for k, v in header.settings.model_dump(exclude={"source"}).items() if v is not None}
-    return {**own, **{k: _tuples(v) for k, v in header.settings.source.items()}}
+    sets = {SETS: tuple(t.model() for t in header.camera_sets)} if header.camera_sets else {}
+    return {**own, **{k: _tuples(v) for k, v in header.settings.source.items()}, **sets}
 
 
 def _tuples(value: Any) -> Any:

@@ -9,17 +9,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from baarda.cameras import FREE, STATES, Camera
+from baarda.cameras import FREE, STATES, Camera, CameraModel
+from baarda.cameras.own_sets import own_set, terms_of
 from baarda.errors import UsageError
 from baarda.formats.base import label_problem
 from baarda.formats.csv_table import csv_text, numbers_text, quoted
 from baarda.formats.folder import write_folder
-from baarda.formats.project_file import DEFAULT_NAMES, FILE, header_text
+from baarda.formats.project_file import DEFAULT_NAMES, FILE, SETS, header_text
+from baarda.formats.project_kinds import declared_columns, kind_table_of
 from baarda.geometry import rotation as rot
 from baarda.network import AXES, EXTERIOR, ROLES, TIE, Images, Network, Points
-from baarda.observations import Distances, ImagePoints
+from baarda.observations import Distances, ImageCoordinates, ImagePoints
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
 Columns = dict[str, list[str]]
 
 MATRIX = tuple(f"r{i}{j}" for i in "123" for j in "123")
@@ -60,6 +63,8 @@ def project_files(network: Network) -> dict[str, str]:
     if network.images.labels:
         tables["images"] = _images(network)
     tables["points"] = _points(network.points)
+    if network.declared:
+        tables["declared"] = declared_columns(network.declared)
     groups = []
     parts: dict[str, list[Columns]] = {}
     names = [g.name for g in network.observations]
@@ -67,15 +72,23 @@ def project_files(network: Network) -> dict[str, str]:
         if names.count(group.name) > 1:
             raise UsageError(f"two groups of observations are called {group.name!r}")
         if isinstance(group, ImagePoints):
-            keys = group.images * len(network.points.labels) + group.points
+            singles = [g.whole for g in network.observations if isinstance(g, ImageCoordinates) and g.whole.name == group.name]
+            keys = np.concatenate([g.images * len(network.points.labels) + g.points for g in (group, *singles)])
             entry: dict[str, Any] = {"name": group.name, "kind": "image_points", "residual_plane": group.residual_plane}
             if len(np.unique(keys)) < len(keys):
                 entry["repeated"] = True
             columns = _image_points(group, network)
+        elif isinstance(group, ImageCoordinates):
+            if group.whole.name in names:  # rows of their group of image points
+                parts.setdefault("image_points", []).append(_image_points(group.whole, network, group.axes))
+                continue
+            entry = {"name": group.whole.name, "kind": "image_points", "residual_plane": group.whole.residual_plane}
+            columns = _image_points(group.whole, network, group.axes)
         elif isinstance(group, Distances):
             entry, columns = {"name": group.name, "kind": "distances"}, _distances(group, network)
         else:
-            raise UsageError(f"observations of the kind {type(group).__name__} cannot be written to a project")
+            kind_table = kind_table_of(group)
+            entry, columns = {"name": group.name, "kind": kind_table.kind}, kind_table.write(group, network)
         groups.append(entry)
         if len(group):
             parts.setdefault(entry["kind"], []).append(columns)
@@ -86,17 +99,31 @@ def project_files(network: Network) -> dict[str, str]:
             del joined["group"]
         if set(joined.get("correlation", ())) == {"0.0"}:
             del joined["correlation"]
+        if set(joined.get("used", ())) == {"xy"}:
+            del joined["used"]
         tables[kind] = joined
     header = header_text(
         network.name,
         network.unit,
         tuple(np.asarray(network.offset, dtype=float).tolist()),
         network.assumptions,
-        dict(network.settings),
+        {k: v for k, v in network.settings.items() if k != SETS},
         {kind: f"{kind}.csv" for kind in tables},
         groups,
+        _own_sets(network),
     )
     return {FILE: header, **{f"{kind}.csv": csv_text(_filled(columns)) for kind, columns in tables.items()}}
+
+
+def _own_sets(network: Network) -> list[CameraModel]:
+    """Return the sets of one's own that the network keeps or its cameras use, by name."""
+    found = {m.name: m for m in network.settings.get(SETS, ())}
+    for camera in network.cameras:
+        for name, terms in terms_of(camera.model).items():
+            known = found.setdefault(name, own_set(name, terms))
+            if terms_of(known)[name] != terms:
+                raise UsageError(f"two different sets of camera parameters are called {name!r}")
+    return list(found.values())
 
 
 def _filled(columns: Columns) -> Columns:
@@ -139,6 +166,7 @@ def _cameras(cameras: Sequence[Camera]) -> Columns:
         "y_down": ["true" if cameras[i].y_down else "false" for i in n],
         "width": numbers_text(image[:, 0]),
         "height": numbers_text(image[:, 1]),
+        "grid_half_width": numbers_text(np.array([np.nan if c.grid is None else c.grid for c in cameras])),
     }
 
 
@@ -195,7 +223,7 @@ def _known(names: Sequence[str], table: Images | Points, everywhere: bool) -> Co
     return out
 
 
-def _image_points(group: ImagePoints, network: Network) -> Columns:
+def _image_points(group: ImagePoints, network: Network, axes: Ints | None = None) -> Columns:
     images, points = ([quoted(t) for t in table.labels] for table in (network.images, network.points))
     return {
         "group": [quoted(group.name)] * len(group),
@@ -206,6 +234,7 @@ def _image_points(group: ImagePoints, network: Network) -> Columns:
         "sigma_x": numbers_text(group.sigmas[:, 0]),
         "sigma_y": numbers_text(group.sigmas[:, 1]),
         "correlation": numbers_text(group.correlations),
+        "used": ["xy"] * len(group) if axes is None else ["xy"[i] for i in axes.tolist()],
     }
 
 

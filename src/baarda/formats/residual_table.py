@@ -381,7 +381,7 @@ def _no_number(name: str, text: str, file: Path, line: int, separator: str) -> I
 
 
 # What NumPy raises on headers that were written by nobody or by chance.
-_HEADER_ERRORS = (
+HEADER_ERRORS = (
     ValueError,
     OSError,
     EOFError,
@@ -402,7 +402,7 @@ def _read_npy(file: Path, wanted: _Wanted, assumptions: list[str]) -> tuple[_Cho
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of headers that Python 2 wrote
             data = np.load(file, mmap_mode="r", allow_pickle=False)
-    except _HEADER_ERRORS as error:
+    except HEADER_ERRORS as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         if "pickle" in reason or "object" in reason.lower():
             reason = "an array of Python objects is refused: save numbers"

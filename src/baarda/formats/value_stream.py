@@ -162,7 +162,9 @@ def _choose(column: str | None, numeric: list[str], names: list[str], file: Path
 
 
 @dataclass(frozen=True)
-class _Parquet(ValueStream):
+class ParquetStream(ValueStream):
+    """A column of a Parquet file."""
+
     def __iter__(self) -> Iterator[np.ndarray]:
         source = _parquet(self.file)
         try:
@@ -197,13 +199,13 @@ def _parquet(file: Path) -> Any:
         raise InputError(f"damaged Parquet file: {error}", file) from None
 
 
-def _open_parquet(file: Path, column: str | None, piece: int) -> _Parquet:
+def _open_parquet(file: Path, column: str | None, piece: int) -> ParquetStream:
     source = _parquet(file)
     types: Any = importlib.import_module("pyarrow").types
     try:
         schema = source.schema_arrow
         numeric = [field.name for field in schema if types.is_floating(field.type) or types.is_integer(field.type)]
         chosen = _choose(column, numeric, list(schema.names), file)
-        return _Parquet(file, int(source.metadata.num_rows), chosen, piece)
+        return ParquetStream(file, int(source.metadata.num_rows), chosen, piece)
     finally:
         source.close()

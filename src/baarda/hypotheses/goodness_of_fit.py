@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy import special, stats
 
 from baarda.distributions import law as find_law
 from baarda.distributions.base import Distribution, Law
@@ -22,7 +22,7 @@ from baarda.distributions.histogram import (
     merge_small,
     usual_number_of_classes,
 )
-from baarda.distributions.replicas import columnwise, refit_columns
+from baarda.distributions.replicas import both_areas, refit_columns
 from baarda.distributions.result import Fit
 from baarda.distributions.sample import check_values
 from baarda.errors import UsageError
@@ -324,7 +324,7 @@ def _test(
         cls = member.distribution
         z = (columns - parameters["loc"]) / parameters["scale"]
         own = tuple(parameters[s.name] for s in cls.shapes)
-        return empirical_statistics(columnwise(cls._cdf, cls, z, own), columnwise(cls._sf, cls, z, own))[which]
+        return empirical_statistics(*both_areas(cls, z, own))[which]
 
     statistic, null = _simulated(x, found.distribution, errors, residuals_of, replicas, seed, of_columns)
     return TestResult(
@@ -494,5 +494,7 @@ def from_evidence(evidence: Evidence, options: Options) -> list[TestResult]:
 def _normal_statistic(columns: Floats) -> Floats:
     """Anderson-Darling's statistic of each column for the normal law with mean zero and the column's own scale."""
     z = np.sort(columns, axis=0) / np.sqrt(np.mean(columns**2, axis=0))
-    normal = find_law("normal").distribution
-    return empirical_statistics(normal._cdf(z), normal._sf(z))[2]
+    tail = special.ndtr(-np.abs(z))  # four times as fast as the law itself, which keeps its last digits far out in the tails
+    rest = 1.0 - tail
+    above = z > 0.0
+    return empirical_statistics(np.where(above, rest, tail), np.where(above, tail, rest))[2]

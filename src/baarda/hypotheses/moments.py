@@ -11,13 +11,26 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from baarda.errors import UsageError
+from baarda.hypotheses._laws import check_redundancy, check_variance, number
 from baarda.hypotheses._simulation import controlled, null_note, shares, simulate, skipped_note
 from baarda.hypotheses.base import Evidence, Floats, Law, SimulatedLaw, TestResult
 from baarda.hypotheses.levels import Options, check_level
+from baarda.hypotheses.outliers import TauLaw
 
-__all__ = ["KurtosisLaw", "SkewnessLaw", "kurtosis_of_residuals", "mean_of_residuals", "skewness_of_residuals"]
+__all__ = [
+    "KurtosisLaw",
+    "SkewnessLaw",
+    "kurtosis_of_residuals",
+    "mean_of_residuals",
+    "moment_tests",
+    "not_applicable",
+    "skewness_of_residuals",
+    "sum_of_residuals",
+]
 
 ORDER = 20
+_VANISHING = 1e-10  # of 1'Qvv1 relative to 1'Q1: residuals that sum to zero whatever the errors
+_PROBES = 8
 
 
 @dataclass(frozen=True)
@@ -159,14 +172,54 @@ def _law(index: int, n: int) -> tuple[Law, str]:
 
 
 def _test(index: int, x: Floats, alpha: float, simulated: Floats | None, note: str) -> TestResult:
-    n = len(x)
+    _, skewness, kurtosis = _moments(x[:, None])[0]
+    moments = (float(x.mean()), float(x.std(ddof=1)), float(skewness), float(kurtosis))
+    return _of_moments(index, len(x), moments, alpha, simulated, note)
+
+
+def _of_moments(
+    index: int, n: int, moments: tuple[float, float, float, float], alpha: float, simulated: Floats | None, note: str
+) -> TestResult:
     law, spoken = _law(index, n) if simulated is None else (SimulatedLaw(np.sort(simulated)), f"simulated, {len(simulated)} replicas")
-    t, skewness, kurtosis = _moments(x[:, None])[0]
-    details = {"n": n, "mean": float(x.mean()), "standard_deviation": float(x.std(ddof=1))}
-    details |= {"skewness": float(skewness), "kurtosis": float(kurtosis)}
+    mean, deviation, skewness, kurtosis = moments
+    details = {"n": n, "mean": mean, "standard_deviation": deviation, "skewness": skewness, "kurtosis": kurtosis}
     df = (float(n - 1),) if index == 0 and simulated is None else ()
-    statistic = float((t, skewness, kurtosis)[index])
+    statistic = float((mean * np.sqrt(n) / deviation, skewness, kurtosis)[index])
     return TestResult(_NAMES[index], _NULLS[index], statistic, law, spoken, alpha, "two-sided", df, note=note, details=details)
+
+
+def moment_tests(n: int, moments: tuple[float, float, float, float], alpha: float = 0.05, note: str = "") -> list[TestResult]:
+    """Return the tests of mean, skewness and kurtosis of n independent values of which only the moments are at hand.
+
+    Parameters
+    ----------
+    n : int
+        Number of values, at least 20.
+    moments : tuple of float
+        Mean, standard deviation (n - 1), skewness, kurtosis (3 for the normal law).
+    alpha : float
+        Level.
+    note : str
+        Added to each.
+
+    Returns
+    -------
+    list of TestResult
+
+    Raises
+    ------
+    UsageError
+        If n is too small.
+
+    Examples
+    --------
+    >>> [t.p_value for t in moment_tests(1000, (0.0, 1.0, 0.1, 3.2))]
+    [1.0, 0.195, 0.192]
+    """
+    check_level(alpha)
+    if n < _LEAST[2]:
+        raise UsageError(f"{n} values: at least {_LEAST[2]} are needed")
+    return [_of_moments(i, n, moments, alpha, None, note) for i in range(3)]
 
 
 def mean_of_residuals(residuals: ArrayLike, alpha: float = 0.05, simulated: ArrayLike | None = None, note: str = "") -> TestResult:
@@ -271,8 +324,129 @@ def kurtosis_of_residuals(residuals: ArrayLike, alpha: float = 0.05, simulated: 
     return _test(2, _checked(residuals, least), alpha, None if simulated is None else np.asarray(simulated, dtype=float), note)
 
 
+@dataclass(frozen=True)
+class _Undecided:
+    """The law of a statistic that cannot decide: every value is as likely as any other, p = 1."""
+
+    def cdf(self, x: Any) -> Any:
+        """Return 1."""
+        return np.ones_like(np.asarray(x, dtype=float))[()]
+
+    def sf(self, x: Any) -> Any:
+        """Return 1."""
+        return np.ones_like(np.asarray(x, dtype=float))[()]
+
+    def ppf(self, q: Any) -> Any:
+        """Return 0."""
+        return np.zeros_like(np.asarray(q, dtype=float))[()]
+
+
+def not_applicable(name: str, null: str, why: str, alpha: float = 0.05) -> TestResult:
+    """Return the outcome of a test that says nothing about these data: p = 1, and the reason in words.
+
+    Parameters
+    ----------
+    name, null : str
+        Of the test.
+    why : str
+        The reason, a sentence without its first words "Not applicable:".
+    alpha : float
+        Level.
+
+    Returns
+    -------
+    TestResult
+        `details["applicable"]` is False: reports show the words and no numbers.
+
+    Examples
+    --------
+    >>> t = not_applicable("mean_of_residuals", "The residuals have expectation zero.", "1'Qvv1 is zero.")
+    >>> t.p_value, t.rejected, t.note
+    (1.0, False, "Not applicable: 1'Qvv1 is zero.")
+    """
+    details = {"applicable": False}
+    return TestResult(name, null, 0.0, _Undecided(), "not applicable", alpha, "two-sided", note=f"Not applicable: {why}", details=details)
+
+
+def sum_of_residuals(
+    total: float, cofactor: float, variance_factor: float, redundancy: float, alpha: float = 0.05, scale: float = 1.0, note: str = ""
+) -> TestResult:
+    """Test whether the residuals of an adjustment have expectation zero, by their sum 1'v and its cofactor 1'Qvv1: two-sided.
+
+    Parameters
+    ----------
+    total : float
+        1'v, the sum of the residuals, or of v / sigma where weights differ.
+    cofactor : float
+        1'Qvv1 of the same residuals.
+    variance_factor : float
+        A-posteriori variance factor s0^2 of the adjustment.
+    redundancy : float
+        r.
+    alpha : float
+        Level.
+    scale : float
+        1'Q1, what the cofactor of the sum would be if the residuals were the errors themselves: below 1e-10 of it the cofactor is zero.
+    note : str
+        Added to the result.
+
+    Returns
+    -------
+    TestResult
+        1'v / (s0 sqrt(1'Qvv1)) under Pope's tau law with r degrees of freedom, exact for normal errors. Not applicable where 1'Qvv1 is
+        zero: then the residuals sum to zero whatever the errors, as with an unknown that is common to all observations.
+
+    Raises
+    ------
+    UsageError
+        If a number is not finite, or variance factor or redundancy are not positive.
+
+    Notes
+    -----
+    Maarek & Konecny, section 2, with the variance of the mean of adjusted residuals in place of S^2 / n.
+
+    Examples
+    --------
+    >>> t = sum_of_residuals(2.4, 3.1, 1.2, 25)
+    >>> t.statistic, t.critical[1], t.law_name
+    (1.244, 1.941, 'tau(25)')
+    >>> sum_of_residuals(1e-13, 1e-15, 1.2, 25).details["applicable"]
+    False
+    """
+    check_level(alpha)
+    check_redundancy(redundancy)
+    check_variance(variance_factor, "the variance factor")
+    if not (np.isfinite(total) and np.isfinite(cofactor)):
+        raise UsageError("the sum of the residuals and its cofactor must be finite")
+    if cofactor <= _VANISHING * scale:
+        why = "1'Qvv1 is zero: the residuals sum to zero whatever the errors, so their mean tells nothing."
+        return not_applicable(_NAMES[0], _NULLS[0], why, alpha)
+    statistic = float(total / np.sqrt(variance_factor * cofactor))
+    details = {"sum": float(total), "cofactor": float(cofactor)}
+    name = f"tau({number(redundancy)})"
+    return TestResult(_NAMES[0], _NULLS[0], statistic, TauLaw(redundancy), name, alpha, "two-sided", note=note, details=details)
+
+
+def _cofactor_of_sum(evidence: Evidence) -> float | None:
+    """Return 1'Qvv1 of v / sigma (variance factor 1); None where the map from errors to residuals is not symmetric.
+
+    Qvv P Qvv = Qvv: for uncorrelated observations the map from whitened errors to v / sigma is -Qvv itself.
+    """
+    if evidence.residuals_of is None:
+        return None
+    n = len(evidence.residuals)
+    probes = np.random.default_rng(0).standard_normal((n, _PROBES))
+    images = np.asarray(evidence.residuals_of(np.column_stack([np.ones(n), probes])), dtype=float)
+    products = probes.T @ images[:, 1:]
+    if not np.allclose(products, products.T, rtol=0.0, atol=1e-8 * float(np.abs(products).max())):
+        return None
+    return float(-images[:, 0].sum())
+
+
 def from_evidence(evidence: Evidence, options: Options) -> list[TestResult]:
-    """Return the tests of mean, skewness and kurtosis on residuals standardised by their own sigma."""
+    """Return the tests of mean, skewness, kurtosis, and of the last two together (Jarque-Bera), on standardised residuals."""
+    from baarda.hypotheses.normality import jarque_bera
+
     seen = controlled(evidence)
     if evidence.vpv <= 0.0 or seen.sum() < 4:
         return []
@@ -281,8 +455,42 @@ def from_evidence(evidence: Evidence, options: Options) -> list[TestResult]:
     x = evidence.residuals[seen] / spread * (evidence.sigma0_apriori / evidence.sigma0)
     if np.ptp(x) == 0.0:
         return []
-    simulated = simulate(evidence, lambda v: _moments(v[seen] * factor), options)
+    simulated = simulate(evidence, lambda v: np.column_stack([_moments(v[seen] * factor), v.sum(axis=0), (v * v).sum(axis=0)]), options)
     note = null_note(evidence, options, 0 if simulated is None else len(simulated)) + skipped_note(int((~seen).sum()))
     level = options.global_level(1)
-    nulls = (None, None, None) if simulated is None else simulated.T
-    return [_test(i, x, level, nulls[i], note) for i in range(3) if simulated is not None or len(x) >= _LEAST[i]]
+    if simulated is None:
+        made = [_test(i, x, level, None, note) for i in range(3) if len(x) >= _LEAST[i]]
+        own = f"Null law by {options.replicas} simulated samples of independent normal values, seed {options.seed}: approximate."
+        return [*made, jarque_bera(x, level, replicas=options.replicas, seed=options.seed, note=own)]
+    moments = [_test(i, x, level, simulated[:, i], note) for i in range(3)]
+    moments[0] = _mean_by_sum(evidence, moments[0], simulated[:, 3], simulated[:, 4])
+    if np.ptp(simulated[:, 1]) <= 1e-9:
+        why = "the residuals are so bound to each other that their skewness is the same whatever the errors."
+        moments[1] = not_applicable(_NAMES[1], _NULLS[1], why, level)
+    return [*moments, jarque_bera(x, level, simulated=_jarque_bera_of(len(x), simulated[:, 1], simulated[:, 2]), note=note)]
+
+
+def _jarque_bera_of(n: int, skewness: Any, kurtosis: Any) -> Any:
+    return n / 6.0 * (skewness**2 + (kurtosis - 3.0) ** 2 / 4.0)
+
+
+def _mean_by_sum(evidence: Evidence, plain: TestResult, sums: Floats, squares: Floats) -> TestResult:
+    """Judge the mean by 1'v and 1'Qvv1 of v / sigma: exactly where observations are uncorrelated, by simulation where they are not."""
+    n, r = len(evidence.residuals), float(evidence.redundancy)
+    total = float((evidence.residuals / evidence.sigmas).sum())
+    factor = evidence.variance_factor / evidence.sigma0_apriori**2
+    cofactor = _cofactor_of_sum(evidence)
+    exact = cofactor is not None
+    value = float(np.mean(sums**2)) if cofactor is None else cofactor
+    note = f"1'v / (s0 sqrt(1'Qvv1)) of the residuals divided by their sigmas, 1'Qvv1 = {value:.4g} for 1'1 = {n}"
+    t = sum_of_residuals(total, value, factor, r, plain.alpha, float(n), f"{note}: exact for normal errors.")
+    details = {**plain.details, **t.details}
+    if exact or not t.details.get("applicable", True):
+        return TestResult(**{**vars(t), "details": details})
+    # with correlated observations s0 of a replica is not at hand from v / sigma: its root mean square stands for it, in data and replicas
+    size = float(np.sqrt(np.mean((evidence.residuals / evidence.sigmas) ** 2)))
+    law = SimulatedLaw(np.sort(sums / np.sqrt(squares / n * value)))
+    said = f"{note} (by simulation), s0 by the root mean square. {plain.note}"
+    return TestResult(
+        **{**vars(t), "statistic": total / size / np.sqrt(value), "law": law, "law_name": plain.law_name, "note": said, "details": details}
+    )

@@ -1,30 +1,23 @@
-"""General linear hypothesis, and the tests of additional parameters: all, single, pairs, orthogonalised."""
+"""General linear hypothesis, and the tests of additional parameters: all, single, pairs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import linalg, stats
+from scipy import stats
 
 from baarda.errors import Singular, UsageError
+from baarda.hypotheses._estimates import Judged, joined, judged, not_applicable
 from baarda.hypotheses._laws import check_redundancy, check_variance, f_law, f_name, number
-from baarda.hypotheses._quadratic import factor, quadratic_form, ranked_form, variances, vector_and_matrix
-from baarda.hypotheses.base import Estimates, Evidence, Floats, Law, TestResult
+from baarda.hypotheses._quadratic import quadratic_form, ranked_form, variances, vector_and_matrix
+from baarda.hypotheses.base import Evidence, Floats, Law, TestResult
 from baarda.hypotheses.levels import Options, Policy, check_level, family_result
 
-__all__ = [
-    "Orthogonalised",
-    "bivariate_parameters",
-    "general_linear",
-    "orthogonalise",
-    "orthogonalised_parameters",
-    "single_parameter",
-]
+__all__ = ["bivariate_parameters", "general_linear", "single_parameter"]
 
 ORDER = 50
 
@@ -279,177 +272,42 @@ def bivariate_parameters(
     )
 
 
-@dataclass(frozen=True)
-class Orthogonalised:
-    """Uncorrelated combinations of correlated estimates.
-
-    Attributes
-    ----------
-    values : (k,) array
-        z*, uncorrelated.
-    cofactors : (k,) array
-        Their cofactors.
-    back : (k, k) array
-        z = back @ z*: the way back, also after components were set to zero.
-    """
-
-    values: Floats
-    cofactors: Floats
-    back: Floats
-
-
-def orthogonalise(
-    values: ArrayLike, cofactors: ArrayLike, basis: Literal["eigen", "triangular"] = "eigen", names: Sequence[str] = ()
-) -> Orthogonalised:
-    """Return uncorrelated combinations of estimates.
-
-    Parameters
-    ----------
-    values : (k,) array
-        Estimates z.
-    cofactors : (k, k) array
-        Their cofactors.
-    basis : {"eigen", "triangular"}
-        Eigenvectors of the correlation matrix (independent of units), or the triangular factor (keeps the order: component j is
-        parameter j cleaned of the earlier ones).
-    names : sequence of str
-        For messages.
-
-    Returns
-    -------
-    Orthogonalised
-
-    Raises
-    ------
-    Singular
-        If a parameter is a combination of others.
-    UsageError
-        If the basis is unknown or shapes do not fit.
-
-    Notes
-    -----
-    Grün (1978) p. 397: feasible a posteriori in close range; sum of t_i^2 = p T of the joint test.
-
-    Examples
-    --------
-    >>> o = orthogonalise([1.0, 2.0], [[4.0, 1.0], [1.0, 2.0]], "triangular")
-    >>> o.values, o.cofactors
-    (array([1.  , 1.75]), array([4.  , 1.75]))
-    """
-    z, q = vector_and_matrix(values, cofactors)
-    s, lower = factor(q, names)
-    if basis == "triangular":
-        pivots = np.diagonal(lower)
-        star = np.asarray(linalg.solve_triangular(lower, z / s, lower=True)) * pivots * s
-        return Orthogonalised(star, (pivots * s) ** 2, s[:, None] * lower / (pivots * s)[None, :])
-    if basis != "eigen":
-        raise UsageError(f"the basis is 'eigen' or 'triangular', not {basis!r}")
-    share, vectors = linalg.eigh(lower @ lower.T)
-    # Best determined last in LAPACK's order; a sign rule makes the result reproducible.
-    vectors = vectors * np.where(vectors[np.abs(vectors).argmax(axis=0), np.arange(len(z))] < 0.0, -1.0, 1.0)
-    return Orthogonalised(vectors.T @ (z / s), share, s[:, None] * vectors)
-
-
-def orthogonalised_parameters(
-    values: ArrayLike,
-    cofactors: ArrayLike,
-    variance_factor: float,
-    redundancy: float,
-    alpha: float = 0.05,
-    levels: Policy = "none",
-    names: Sequence[str] = (),
-    basis: Literal["eigen", "triangular"] = "eigen",
-    name: str = "orthogonalised_parameters",
-) -> TestResult:
-    """Test uncorrelated combinations of the parameters one by one: t tests that correlation does not mislead.
-
-    Parameters
-    ----------
-    values, cofactors, variance_factor, redundancy, alpha, levels, names, name
-        As in `general_linear` and `single_parameter`.
-    basis : {"eigen", "triangular"}
-        See `orthogonalise`.
-
-    Returns
-    -------
-    TestResult
-        A family: z*_i / (s0 sqrt(d_i)) under t(r); labels name the parameters that dominate a component.
-
-    Raises
-    ------
-    Singular, UsageError, RedundancyNotPositive
-        As `orthogonalise` and `single_parameter`.
-
-    Notes
-    -----
-    Grün (1978) p. 397.
-
-    Examples
-    --------
-    >>> t = orthogonalised_parameters([1.0, 2.0], [[1.0, 0.5], [0.5, 2.0]], 0.25, 10)
-    >>> float((t.statistic**2).sum() / 2)  # T of general_linear
-    4.571
-    """
-    o = orthogonalise(values, cofactors, basis, names)
-    words = tuple(names) or tuple(f"parameter {i + 1}" for i in range(len(o.values)))
-    weights = np.abs(o.back) / np.sqrt(variances(np.asarray(cofactors, dtype=float), names))[:, None]
-    if basis == "triangular":
-        labels = [words[0], *(f"{w} cleaned of the earlier ones" for w in words[1:])]
-    else:
-        labels = []
-        for j in range(len(words)):
-            order = np.argsort(-weights[:, j], kind="stable")
-            main = [words[i] for i in order if weights[i, j] > 0.5 * weights[order[0], j]][:4]
-            labels.append(f"component {j + 1} ({', '.join(main)})")
-    t = single_parameter(o.values, o.cofactors, variance_factor, redundancy, 0.0, alpha, levels, labels, name)
-    details = {**t.details, "basis": basis}
-    null = "The uncorrelated combination of the parameters is zero."
-    return TestResult(t.name, null, t.statistic, t.law, t.law_name, t.alpha, t.tail, t.df, t.labels, t.note, details)
-
-
-def _all_parameters(e: Estimates, variance_factor: float, redundancy: float, options: Options) -> TestResult:
+def _all_parameters(j: Judged, options: Options) -> TestResult:
     """Return the joint test; where parameters depend on each other, of the combinations that are determined."""
-    name, null = "all_additional_parameters", "All additional parameters are zero."
-    level = options.global_level(len(e.values))
+    name, null, e = "all_additional_parameters", "All additional parameters are zero.", j.estimates
+    level, r = options.global_level(len(e.values)), j.redundancy
     try:
-        return general_linear(e.values, e.cofactors, variance_factor, redundancy, None, level, names=e.names, name=name, null=null)
+        found = general_linear(e.values, e.cofactors, j.variance_factor, r, None, level, names=e.names, name=name, null=null)
+        return replace(found, note=j.note)
     except Singular as error:
         form, rank = ranked_form(*vector_and_matrix(e.values, e.cofactors), np.sqrt(np.diagonal(e.cofactors)))
-        df = (float(rank), float(redundancy)) if np.isfinite(redundancy) else (float(rank),)
-        note = f"Tested are the {rank} of {len(e.values)} combinations that are determined: {error}."
+        df = (float(rank), r) if np.isfinite(r) else (float(rank),)
+        note = joined(f"Tested are the {rank} of {len(e.values)} combinations that are determined: {error}.", j.note)
         level = options.global_level(rank)
-        return TestResult(
-            name, null, form / (rank * variance_factor), f_law(rank, redundancy), f_name(rank, redundancy), level, df=df, note=note
-        )
+        return TestResult(name, null, form / (rank * j.variance_factor), f_law(rank, r), f_name(rank, r), level, df=df, note=note)
 
 
 def from_evidence(evidence: Evidence, options: Options) -> list[TestResult]:
-    """Return the tests of the additional parameters: all, single, pairs, orthogonalised."""
-    e = evidence.additional
-    if e is None or len(e.values) == 0 or evidence.vpv <= 0.0:
+    """Return the tests of the additional parameters: all, single, pairs."""
+    j = judged(evidence, options)
+    if j is None:
         return []
-    aposteriori = options.sigma == "aposteriori"
-    factor0 = evidence.variance_factor if aposteriori else evidence.sigma0_apriori**2
-    r = float(evidence.redundancy) if aposteriori else np.inf
-    alpha, policy = options.global_level(1), options.levels
-    results = [
-        _all_parameters(e, factor0, r, options),
-        single_parameter(e.values, e.cofactors, factor0, r, 0.0, alpha, policy, e.names, "additional_parameter"),
-    ]
-    if len(e.values) >= 2:
-        results += _correlated(e, factor0, r, options)
-    return results
+    e, r, policy = j.estimates, j.redundancy, options.levels
+    alpha = options.global_level(1)
+    name, null = "additional_parameter", "The parameter equals its expected value (zero unless stated)."
+    if not len(e.values):
+        return [not_applicable(name, null, "the cofactors of all additional parameters are zero", alpha, r, j.left_out)]
+    single = single_parameter(e.values, e.cofactors, j.variance_factor, r, 0.0, alpha, policy, e.names, name)
+    results = [_all_parameters(j, options), replace(single, note=joined(single.note, j.note))]
+    return results if len(e.values) < 2 else [*results, _pairs(j, options)]
 
 
-def _correlated(e: Estimates, factor0: float, r: float, options: Options) -> list[TestResult]:
-    """Return the tests of pairs and of orthogonalised parameters; the joint test says in words where parameters are not distinct."""
-    given = (e.values, e.cofactors, factor0, r)
-    pairs, single = options.global_level(2), options.global_level(1)
-    names, policy = e.names, options.levels
-    results = []
-    with suppress(Singular):
-        limit = options.correlation_limit
-        results.append(bivariate_parameters(*given, limit, pairs, policy, names, "bivariate_additional_parameters"))
-    with suppress(Singular):
-        results.append(orthogonalised_parameters(*given, single, policy, names, name="orthogonalised_additional_parameters"))
-    return results
+def _pairs(j: Judged, options: Options) -> TestResult:
+    e, alpha = j.estimates, options.global_level(2)
+    given = (e.values, e.cofactors, j.variance_factor, j.redundancy)
+    name = "bivariate_additional_parameters"
+    try:
+        return bivariate_parameters(*given, options.correlation_limit, alpha, options.levels, e.names, name)
+    except Singular as error:
+        pairs = str(error).partition(": ")[2].split("; ")
+        return not_applicable(name, "Both parameters of the pair are zero.", str(error), alpha, j.redundancy, pairs, 2, options.levels)

@@ -1,5 +1,6 @@
 """The network: who was measured, from where, with what, and what is known beforehand."""
 
+from baarda.network.declared import Declared
 from baarda.network.network import AXES, CHECK, CONTROL, EXTERIOR, ROLES, TIE, Images, Network, Points
 from baarda.network.parameters import State, UnknownGroup, Unknowns, unknowns_of
 from baarda.network.tables import Table
@@ -11,6 +12,7 @@ __all__ = [
     "EXTERIOR",
     "ROLES",
     "TIE",
+    "Declared",
     "Images",
     "Network",
     "Points",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from baarda.cameras import FIXED, FREE, OBSERVED, Camera
 from baarda.errors import UsageError
+from baarda.network.declared import Declared
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -200,6 +201,8 @@ class Network:
         Where the network was read from.
     sha256 : str or None
         Of the source file, or over the sorted names and contents of a source folder.
+    declared : tuple of Declared
+        Groups of unknowns that observation kinds declare for themselves, each of another kind.
     """
 
     cameras: tuple[Camera, ...]
@@ -214,6 +217,7 @@ class Network:
     path: str = ""
     format: str = ""
     sha256: str | None = None
+    declared: tuple[Declared, ...] = ()
 
     def shifted(self, shift: Floats) -> Network:
         """Return the network with `shift` added to all object coordinates; `offset` remembers the sum."""
@@ -224,6 +228,7 @@ class Network:
             images=replace(im, position=im.position + shift, given=given),
             points=replace(pt, coordinates=pt.coordinates + shift, given=pt.given + shift),
             offset=self.offset + shift,
+            declared=tuple(d.shifted(shift) for d in self.declared),
         )
 
     def centroid(self) -> Floats:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from baarda.cameras import FIXED
 from baarda.errors import UsageError
 from baarda.geometry import rotation as rot
+from baarda.network.declared import Declared
 from baarda.network.network import AXES, EXTERIOR, Network
 
 Floats = NDArray[np.float64]
@@ -51,7 +52,7 @@ class UnknownGroup:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """The vector of unknowns: cameras, then images, then points; fixed parameters have no column."""
+    """The vector of unknowns: cameras, images, points, then what observation kinds declare; fixed parameters have no column."""
 
     groups: tuple[UnknownGroup, ...]
 
@@ -123,6 +124,11 @@ def unknowns_of(network: Network, points: NDArray[np.bool_] | None = None, camer
     Returns
     -------
     Unknowns
+
+    Raises
+    ------
+    UsageError
+        If two declared groups have the same kind.
     """
     count = 0
 
@@ -152,7 +158,27 @@ def unknowns_of(network: Network, points: NDArray[np.bool_] | None = None, camer
     if points is not None:
         active &= points[:, None]
     point = UnknownGroup("point", table.labels, (AXES,), np.arange(len(table.labels) + 1) * 3, numbered(active.ravel()))
-    return Unknowns((camera, image, point))
+    declared = tuple(
+        UnknownGroup(
+            d.kind, d.labels, d.parameters, d.offsets, numbered((d.states != FIXED) & np.repeat(_observed(network, d, points), d.widths))
+        )
+        for d in network.declared
+    )
+    kinds = [d.kind for d in declared]
+    if len(set(kinds)) < len(kinds):
+        raise UsageError(f"two groups of unknowns are called {next(k for k in kinds if kinds.count(k) > 1)!r}")
+    return Unknowns((camera, image, point, *declared))
+
+
+def _observed(network: Network, group: Declared, points: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """Return which nodes of a declared group have an observation whose points take part; the others have no unknowns."""
+    out = np.zeros(len(group.labels), dtype=bool)
+    for observations in network.observations:
+        nodes = observations.nodes_of().get(group.kind) if hasattr(observations, "nodes_of") else None
+        if nodes is not None:
+            keep = np.ones(len(nodes), dtype=bool) if points is None else np.all([points[end] for end in observations.points_of()], axis=0)
+            out[nodes[keep]] = True
+    return out
 
 
 @dataclass(frozen=True)
@@ -165,12 +191,36 @@ class State:
     position : (images, 3) array
     rotation : (images, 3, 3) array
     points : (points, 3) array
+    declared : tuple of Declared
+        The groups that observation kinds declare, with their current values.
     """
 
     cameras: tuple[Floats, ...]
     position: Floats
     rotation: Floats
     points: Floats
+    declared: tuple[Declared, ...] = ()
+
+    def __getitem__(self, kind: str) -> Declared:
+        found = next((d for d in self.declared if d.kind == kind), None)
+        if found is None:
+            raise UsageError(f"the network has no unknowns of the kind {kind!r}")
+        return found
+
+    def camera_table(self, width: int) -> Floats:
+        """Return the parameters of all cameras as rows (cameras, width); zero for cameras of another number of parameters."""
+        table = self._tables.get(width)
+        if table is None:
+            table = np.zeros((len(self.cameras), width))
+            for i, values in enumerate(self.cameras):
+                if len(values) == width:
+                    table[i] = values
+            self._tables[width] = table
+        return table
+
+    @cached_property
+    def _tables(self) -> dict[int, Floats]:
+        return {}
 
     @staticmethod
     def of(network: Network) -> State:
@@ -180,6 +230,7 @@ class State:
             np.array(network.images.position),
             np.array(network.images.rotation),
             np.array(network.points.coordinates),
+            network.declared,
         )
 
     def moved(self, unknowns: Unknowns, step: Floats) -> State:
@@ -193,6 +244,7 @@ class State:
             self.position + image[:, :3],
             rot.exp(image[:, 3:]) @ self.rotation if len(image) else self.rotation,
             self.points + padded[unknowns["point"].columns].reshape(-1, 3),
+            tuple(d.moved(padded[unknowns[d.kind].columns]) for d in self.declared),
         )
 
     def write_to(self, network: Network) -> Network:
@@ -204,4 +256,5 @@ class State:
             cameras=tuple(c.with_values(v) for c, v in zip(network.cameras, self.cameras, strict=True)),
             images=replace(network.images, position=self.position, rotation=self.rotation),
             points=replace(network.points, coordinates=self.points),
+            declared=self.declared,
         )

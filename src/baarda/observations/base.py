@@ -44,8 +44,8 @@ class Rows:
     misclosure : (N, m) array
         l = observed - computed.
     blocks : tuple of Block
-    cofactor : (N, m, m) array
-        Covariance matrix of each row block for unit variance factor.
+    cofactor : (N, m, m) array, or (N, m)
+        Covariance matrix of each row block for unit variance factor; of uncorrelated rows the variances suffice.
     """
 
     index: Ints

@@ -12,9 +12,23 @@ from baarda.cameras import Optics
 from baarda.errors import UsageError
 from baarda.geometry import collinearity
 from baarda.network import Network, State
+from baarda.observations import kernels
 from baarda.observations.base import Block, Floats, Ints, Rows
 
 CHUNK = 16384
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Rows that share a camera model with its constants."""
+
+    optics: Optics
+    rows: Ints
+
+    @property
+    def width(self) -> int:
+        """The number of camera parameters."""
+        return len(self.optics.model.order)
 
 
 @dataclass(frozen=True)
@@ -104,17 +118,17 @@ class ImagePoints:
         """Return image and point codes."""
         return {"image": self.images, "point": self.points}
 
-    def _chunks(self, network: Network) -> list[tuple[Optics, Ints, int]]:
-        """Split the rows by optics (model and constants), then into chunks of fixed size."""
+    def pieces(self, network: Network) -> list[Piece]:
+        """Split the rows by optics (model and constants), then into pieces of fixed size that can be handled side by side."""
         optics: dict[tuple[Any, ...], tuple[Optics, list[int]]] = {}
         for i, c in enumerate(network.cameras):
-            key = (c.model.name, *np.ravel(c.pixel_size), *np.ravel(c.origin), c.y_down)
+            key = (c.model.name, *np.ravel(c.pixel_size), *np.ravel(c.origin), c.y_down, c.half_width)
             optics.setdefault(key, (Optics.of(c), []))[1].append(i)
         camera = network.images.cameras[self.images]
         out = []
         for o, members in optics.values():
             rows = np.flatnonzero(np.isin(camera, members)) if len(optics) > 1 else np.arange(len(self))
-            out += [(o, rows[a : a + CHUNK], len(o.model.order)) for a in range(0, len(rows), CHUNK)]
+            out += [Piece(o, rows[a : a + CHUNK]) for a in range(0, len(rows), CHUNK)]
         return out
 
     def _computed(self, optics: Optics, rows: Ints, network: Network, state: State) -> tuple[Any, ...]:
@@ -128,46 +142,85 @@ class ImagePoints:
         return p, camera, image, rotation, vectors, ideal, d_vectors, in_front
 
     def linearize(self, network: Network, state: State) -> list[Rows]:
-        """Linearise all rows in chunks; see `Kind.linearize`."""
-        out = []
-        for optics, rows, _ in self._chunks(network):
-            p, camera, image, rotation, vectors, ideal, d_vectors, _front = self._computed(optics, rows, network, state)
-            measured = self.xy[rows]
-            if self.residual_plane == "image":
-                computed, d_ideal, d_camera, _ = optics.distort(ideal, p, start=measured)
-                misclosure = measured - computed
-            else:
-                projected, d_ideal, p_camera = optics.from_ideal(ideal, p)
-                corrected, _, m_camera = optics.from_measured(measured, p)
-                factor = _to_pixels(optics)
-                misclosure = (corrected - projected) * factor
-                d_ideal, d_camera = d_ideal * factor[:, None], (p_camera - m_camera) * factor[:, None]
-            d_exterior, d_point = collinearity.partials(rotation, vectors, d_ideal @ d_vectors)
+        """Linearise all rows in pieces; see `Kind.linearize`."""
+        return [self.linearize_piece(network, state, piece) for piece in self.pieces(network)]
+
+    def linearize_piece(self, network: Network, state: State, piece: Piece) -> Rows:
+        """Linearise the rows of a piece."""
+        optics, rows = piece.optics, piece.rows
+        quick = self._compiled(piece, network, state, partials=True)
+        if quick is not None:
+            image = self.images[rows]
+            misclosure, d_camera, d_exterior, d_point = quick
+            camera = network.images.cameras[image]
             blocks = (Block("camera", camera, d_camera), Block("image", image, d_exterior), Block("point", self.points[rows], d_point))
-            out.append(Rows(rows, misclosure, blocks, self._cofactor(rows)))
-        return out
+            return Rows(rows, misclosure, blocks, self._cofactor(rows))
+        p, camera, image, rotation, vectors, ideal, d_vectors, _front = self._computed(optics, rows, network, state)
+        measured = self.xy[rows]
+        if self.residual_plane == "image":
+            computed, d_ideal, d_camera, _ = optics.distort(ideal, p, start=measured)
+            misclosure = measured - computed
+        else:
+            projected, d_ideal, p_camera = optics.from_ideal(ideal, p)
+            corrected, _, m_camera = optics.from_measured(measured, p)
+            factor = _to_pixels(optics)
+            misclosure = (corrected - projected) * factor
+            d_ideal, d_camera = d_ideal * factor[:, None], (p_camera - m_camera) * factor[:, None]
+        d_exterior, d_point = collinearity.partials(rotation, vectors, d_ideal @ d_vectors)
+        blocks = (Block("camera", camera, d_camera), Block("image", image, d_exterior), Block("point", self.points[rows], d_point))
+        return Rows(rows, misclosure, blocks, self._cofactor(rows))
 
     def misclosures(self, network: Network, state: State) -> Floats:
         """Return observed - computed, (n, 2)."""
         out = np.empty((len(self), 2))
-        for optics, rows, _ in self._chunks(network):
-            p, *_, ideal, _d, _front = self._computed(optics, rows, network, state)
-            measured = self.xy[rows]
-            if self.residual_plane == "image":
-                out[rows] = measured - optics.distort(ideal, p, start=measured)[0]
-            else:
-                out[rows] = (optics.from_measured(measured, p)[0] - optics.from_ideal(ideal, p)[0]) * _to_pixels(optics)
+        for piece in self.pieces(network):
+            out[piece.rows] = self.misclosures_of_piece(network, state, piece)
         return out
+
+    def misclosures_of_piece(self, network: Network, state: State, piece: Piece) -> Floats:
+        """Return observed - computed of the rows of a piece."""
+        optics, rows = piece.optics, piece.rows
+        quick = self._compiled(piece, network, state, partials=False)
+        if quick is not None:
+            return quick[0]
+        p, *_, ideal, _d, _front = self._computed(optics, rows, network, state)
+        measured = self.xy[rows]
+        if self.residual_plane == "image":
+            return np.asarray(measured - optics.distort(ideal, p, start=measured)[0])
+        return np.asarray((optics.from_measured(measured, p)[0] - optics.from_ideal(ideal, p)[0]) * _to_pixels(optics))
+
+    def _compiled(self, piece: Piece, network: Network, state: State, partials: bool) -> tuple[Floats, Floats, Floats, Floats] | None:
+        """Evaluate a piece by compiled loops; None for small groups, other cameras, and where a distortion cannot be inverted."""
+        table = state.camera_table(piece.width)
+        if len(self) < kernels.COMPILE_FROM:
+            return None
+        program, loop = kernels.Program.of(piece.optics), kernels.compiled()
+        if program is None or loop is None:
+            return None
+        optics, image = piece.optics, self.images[piece.rows]
+        n, k = len(image), piece.width
+        misclosure = np.empty((n, 2))
+        count = n if partials else 0
+        d_camera, d_image, d_point = np.empty((count, 2, k)), np.empty((count, 2, 6)), np.empty((count, 2, 3))
+        failed = loop(
+            program.steps, program.places, program.measured, self.residual_plane == "corrected", _to_pixels(optics),
+            np.ascontiguousarray(optics.pixel_size, dtype=float), np.ascontiguousarray(optics.origin, dtype=float), table, state.rotation,
+            state.position, state.points, network.images.cameras[image], image, self.points[piece.rows], self.xy[piece.rows], partials,
+            misclosure, d_camera, d_image, d_point,
+        )  # fmt: skip
+        return None if failed >= 0 else (misclosure, d_camera, d_image, d_point)
 
     def in_front(self, network: Network, state: State) -> NDArray[np.bool_]:
         """Return for each row whether its point lies in front of its camera."""
         out = np.empty(len(self), dtype=bool)
-        for optics, rows, _ in self._chunks(network):
-            out[rows] = self._computed(optics, rows, network, state)[-1]
+        for piece in self.pieces(network):
+            out[piece.rows] = self._computed(piece.optics, piece.rows, network, state)[-1]
         return out
 
     def _cofactor(self, rows: Ints) -> Floats:
         s = self.sigmas[rows]
+        if not np.any(self.correlations[rows]):
+            return np.asarray(s**2)
         q = np.zeros((len(rows), 2, 2))
         q[:, 0, 0], q[:, 1, 1] = s[:, 0] ** 2, s[:, 1] ** 2
         q[:, 0, 1] = q[:, 1, 0] = self.correlations[rows] * s[:, 0] * s[:, 1]

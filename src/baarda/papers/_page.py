@@ -32,8 +32,7 @@ def _shown(value: Value | None, decimals: int) -> str:
 def _difference(r: Row) -> str:
     if r.difference is None or not abs(r.difference) < float("inf"):
         return "" if r.agrees else "differs"
-    text = f"{r.difference:+.{r.decimals}f}"
-    return text if float(text) or not r.agrees else "0"
+    return "0" if r.agrees else f"{r.difference:+.{r.decimals}f}"
 
 
 def _why(r: Row) -> str:

@@ -169,7 +169,7 @@ def critical_values(
     pqvvp = adjustment._statistics["pqvvp"]
     with threadpool_limits(limits=1, user_api="blas"):
         return simulate_critical_values(
-            _statistics_of(adjustment),
+            statistics_of(adjustment),
             adjustment.controlled_share,
             1.0 / np.where(pqvvp > 0.0, pqvvp, np.nan),
             adjustment.redundancy,
@@ -182,7 +182,7 @@ def critical_values(
         )
 
 
-def _statistics_of(adjustment: Adjustment) -> StatisticsOf:
+def statistics_of(adjustment: Adjustment) -> StatisticsOf:
     """Return the map from whitened errors (n, k) to w (n, k) and v'Pv (k,)."""
     root = np.sqrt(adjustment._statistics["pqvvp"])[:, None]
     correlated = [c for c in adjustment.lin.chunks if c.factor.shape[1] > 1 and np.any(np.tril(c.factor, -1))]

@@ -2,35 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from baarda.distributions import law as find_law
-from baarda.distributions.base import Distribution, Floats, Law
+from baarda.distributions.base import Floats, Law
 from baarda.distributions.comparison import compare_laws
 from baarda.distributions.fitting import Fit, fit, profile_interval
 from baarda.distributions.histogram import Ends, check_edges, count, merge_small, probabilities, usual_number_of_classes
-from baarda.distributions.replicas import columnwise, refit_columns
 from baarda.errors import UsageError
-from baarda.hypotheses.base import SimulatedLaw, TestResult
-from baarda.hypotheses.goodness_of_fit import empirical_statistics, normal_against_modulated
+from baarda.hypotheses.base import TestResult
+from baarda.hypotheses.goodness_of_fit import normal_against_modulated
 from baarda.hypotheses.levels import Policy, applied_level, check_level
+from baarda.procedures.law_bootstrap import EXACT, SIMULATED, ClassRule, ResidualsOf, empirical_tests
 
 LAWS = ("normal", "radico", "lineo", "modulated_normal", "student", "laplace", "generalised_normal", "logistic", "contaminated_normal")
-STATISTICS = ("kolmogorov", "cramer_von_mises", "anderson_darling")
-EXACT = 1000  # up to so many values the null laws are simulated with samples of the same size
-SIMULATED = 300  # beyond it, with samples of this size: D sqrt(n), W^2 and A^2 hardly depend on n there
 _FEWEST = 199
-_NUMBERS = 4e7  # simulated values per law, when each replica goes through an adjustment
-_CHUNK = 4_000_000
-_LEAST_WITH_SHAPE = 10
+LEAST_WITH_SHAPE = 10
 
 Classes = Literal["equal_probability", "equal_width"] | tuple[float, ...]
-ResidualsOf = Callable[[Floats], Floats]
 
 
 @dataclass(frozen=True)
@@ -60,6 +53,8 @@ class StudyOptions:
         Confidence level of the interval of a.
     replicas, seed : int
         Of the simulated null laws.
+    numbers : float
+        Errors that are simulated for each law where each replica goes through an adjustment; fewer replicas are made, or none, beyond.
 
     Raises
     ------
@@ -83,6 +78,7 @@ class StudyOptions:
     interval: float = 0.95
     replicas: int = 999
     seed: int = 0
+    numbers: float = 4e7
 
     def __post_init__(self) -> None:
         check_level(self.alpha)
@@ -118,17 +114,21 @@ class LawStudy:
     Attributes
     ----------
     fit : Fit
-        Maximum likelihood, with the chi-square on the common classes.
+        Maximum likelihood, with the chi-square on the common classes and its asymptotic law.
     tests : tuple of TestResult
-        Kolmogorov, Cramér-von Mises, Anderson-Darling, null laws by parametric bootstrap; empty where they cannot be made.
+        Kolmogorov, Cramér-von Mises, Anderson-Darling and, where there are classes, chi-square, null laws by parametric bootstrap: through
+        the design matrix where it is known and affordable, else for independent values; empty where they cannot be made.
+    independent : tuple of TestResult
+        The same tests with null laws for independent values, to be compared: the same as `tests` where there is no design matrix.
     """
 
     fit: Fit
     tests: tuple[TestResult, ...]
+    independent: tuple[TestResult, ...] = ()
 
-    def test(self, name: str) -> TestResult | None:
+    def test(self, name: str, *, independent: bool = False) -> TestResult | None:
         """Return the test of this name."""
-        return next((t for t in self.tests if t.name == name), None)
+        return next((t for t in (self.independent if independent else self.tests) if t.name == name), None)
 
 
 @dataclass(frozen=True)
@@ -141,6 +141,8 @@ class LawsStudied:
         In the order of the options.
     rounded : bool
         Whether the values repeat so much that tests of the distribution function cannot judge; the chi-square judges instead.
+    adjusted : bool
+        Whether the null laws of `tests` and of the likelihood ratio went through the design matrix.
     ratio : TestResult or None
         Likelihood ratio of the normal against the modulated normal law.
     modulated : Fit or None
@@ -153,6 +155,7 @@ class LawsStudied:
 
     laws: tuple[LawStudy, ...]
     rounded: bool
+    adjusted: bool = False
     ratio: TestResult | None = None
     modulated: Fit | None = None
     interval: tuple[float, float] | None = None
@@ -223,25 +226,33 @@ def class_limits(values: ArrayLike, options: StudyOptions) -> Floats:
     """
     x = np.sort(np.asarray(values, dtype=float))
     mean, deviation = _location(x, options), float(np.std(x))
-    normal = find_law("normal")(loc=mean, scale=deviation)
     if not isinstance(options.classes, str):
         edges = check_edges(options.classes)
     else:
-        if options.classes == "equal_probability":
-            # two more classes than the usual two estimated parameters need: one degree of freedom at least
-            k = options.number or usual_number_of_classes(len(x), 2)
-            inner = normal.ppf(np.arange(1, k) / k)
-        elif options.number is None:
-            inner = mean + deviation * np.arange(-3.0, 3.1, 0.5)
-        else:
-            inner = np.linspace(mean - 3.0 * deviation, mean + 3.0 * deviation, options.number + 1)[1:-1]
+        inner = wanted_limits(len(x), mean, deviation, options)
         edges = np.concatenate([[-np.inf], _between(inner, x) if repeats(x) else inner, [np.inf]])
         if len(edges) < 3:
             raise UsageError("the values repeat too much to be divided into classes")
-    counts = count(x, edges, options.ends, is_sorted=True)
+    return merged(edges, count(x, edges, options.ends, is_sorted=True), mean, deviation, options)
+
+
+def wanted_limits(n: int, mean: float, deviation: float, options: StudyOptions) -> Floats:
+    """Return the inner limits of automatic classes of n values."""
+    if options.classes == "equal_probability":
+        # two more classes than the usual two estimated parameters need: one degree of freedom at least
+        k = options.number or usual_number_of_classes(n, 2)
+        return np.asarray(find_law("normal")(loc=mean, scale=deviation).ppf(np.arange(1, k) / k))
+    if options.number is None:
+        return mean + deviation * np.arange(-3.0, 3.1, 0.5)
+    return np.linspace(mean - 3.0 * deviation, mean + 3.0 * deviation, options.number + 1)[1:-1]
+
+
+def merged(edges: Floats, counts: NDArray[np.int64], mean: float, deviation: float, options: StudyOptions) -> Floats:
+    """Return class limits after merging classes in which the normal law expects too few values."""
     if options.merge is None:
         return edges
-    return merge_small(edges, counts, len(x) * probabilities(normal, edges, options.ends), options.merge)[0]
+    normal = find_law("normal")(loc=mean, scale=deviation)
+    return merge_small(edges, counts, int(counts.sum()) * probabilities(normal, edges, options.ends), options.merge)[0]
 
 
 def _location(values: Floats, options: StudyOptions) -> float:
@@ -279,9 +290,9 @@ def study_laws(values: ArrayLike, options: StudyOptions | None = None, residuals
 
     Notes
     -----
-    Chi-square on common classes (Maarek & Konecny, tables 1 to 6); statistics of the distribution function by parametric bootstrap
-    (Stute, Gonzáles Manteiga & Presedo Quindimil 1993); the normal is the bound a = inf of the modulated laws, so the null law of the
-    likelihood ratio is simulated.
+    Chi-square on common classes (Maarek & Konecny, tables 1 to 6), under its asymptotic law and by bootstrap; statistics of the
+    distribution function by parametric bootstrap (Stute, Gonzáles Manteiga & Presedo Quindimil 1993); the normal is the bound a = inf of
+    the modulated laws, so the null law of the likelihood ratio is simulated.
 
     Examples
     --------
@@ -302,28 +313,49 @@ def study_laws(values: ArrayLike, options: StudyOptions | None = None, residuals
         edges = None
         left_out.append(("chi-square on classes", str(error)))
     replicas = _affordable(len(x), o, residuals_of)
-    if not replicas:
-        left_out.append(("tests by simulated adjustments", f"{len(x)} values are too many to simulate"))
-    studied = []
-    for name in o.laws:
+    through = residuals_of if replicas else None
+    if residuals_of is not None and through is None:
+        left_out.append(
+            ("tests by simulated adjustments", f"{len(x)} values are too many to simulate; null laws are for independent values")
+        )
+    x_given = np.asarray(values, dtype=float)
+
+    def one(name: str) -> LawStudy | tuple[str, str]:
         member = find_law(name)
-        least = _LEAST_WITH_SHAPE if member.free_shapes else 3
+        least = LEAST_WITH_SHAPE if member.free_shapes else 3
         if len(x) < least:
-            left_out.append((f"law {name.replace('_', ' ')}", f"it needs at least {least} values"))
-            continue
+            return f"law {name.replace('_', ' ')}", f"it needs at least {least} values"
         try:
             found = _fitted(x, member, edges, o)
-            tests = empirical_tests(values, found, replicas, o.seed, o.alpha, residuals_of) if replicas else ()
+            classes = None if edges is None else class_rule(x, edges, o, through is not None)
+            drawn = replicas or o.replicas
+            plain = empirical_tests(x, found, drawn, o.seed, o.alpha, classes=classes)
+            tests = plain if through is None else empirical_tests(x_given, found, drawn, o.seed, o.alpha, through, classes)
         except UsageError as error:
-            left_out.append((f"law {name.replace('_', ' ')}", str(error)))
-            continue
-        studied.append(LawStudy(found, tests))
-    made = LawsStudied(tuple(studied), rounded, left_out=tuple(left_out))
+            return f"law {name.replace('_', ' ')}", str(error)
+        return LawStudy(found, tests, plain)
+
+    done = [one(name) for name in o.laws]
+    studied = [d for d in done if isinstance(d, LawStudy)]
+    left_out += [d for d in done if isinstance(d, tuple)]
+    made = LawsStudied(tuple(studied), rounded, through is not None, left_out=tuple(left_out))
     if "modulated_normal" not in o.laws:
         return made
-    if len(x) < _LEAST_WITH_SHAPE:
-        return replace(made, left_out=(*made.left_out, ("normal against modulated", f"it needs at least {_LEAST_WITH_SHAPE} values")))
-    return _modulated(np.asarray(values, dtype=float), made, o, replicas, residuals_of)
+    if len(x) < LEAST_WITH_SHAPE:
+        return replace(made, left_out=(*made.left_out, ("normal against modulated", f"it needs at least {LEAST_WITH_SHAPE} values")))
+    return _modulated(np.asarray(values, dtype=float), made, o, replicas or o.replicas, through)
+
+
+def class_rule(x: Floats, edges: Floats, o: StudyOptions, adjusted: bool) -> ClassRule:
+    """Return how class limits follow each simulated data set."""
+    if isinstance(o.classes, str) or adjusted:
+        return class_rule_of(edges, _location(x, o), float(np.std(x)), o)
+    return ClassRule(edges, False, o.loc, o.ends)
+
+
+def class_rule_of(edges: Floats, mean: float, deviation: float, o: StudyOptions) -> ClassRule:
+    """Return how automatic class limits, found from mean and standard deviation, follow each simulated data set."""
+    return ClassRule((edges - mean) / deviation, True, o.loc, o.ends)
 
 
 def _fitted(x: Floats, member: Law, edges: Floats | None, o: StudyOptions) -> Fit:
@@ -336,106 +368,8 @@ def _affordable(n: int, o: StudyOptions, residuals_of: ResidualsOf | None) -> in
     """Return the number of replicas, 0 where so few are possible that no level could be kept."""
     if residuals_of is None:
         return o.replicas
-    affordable = int(min(o.replicas, _NUMBERS // n))
+    affordable = int(min(o.replicas, o.numbers // n))
     return affordable if affordable >= min(_FEWEST, o.replicas) else 0
-
-
-def empirical_tests(
-    values: ArrayLike, found: Fit, replicas: int = 999, seed: int = 0, alpha: float = 0.05, residuals_of: ResidualsOf | None = None
-) -> tuple[TestResult, ...]:
-    """Test a fitted law by Kolmogorov's, Cramér-von Mises' and Anderson-Darling's statistic with one simulation for all three.
-
-    Parameters
-    ----------
-    values : (n,) array
-        The values that were fitted.
-    found : Fit
-        The law with its values; what it estimated is estimated again in each replica.
-    replicas, seed : int
-        Number of simulated data sets; replica k uses child k of the seed.
-    alpha : float
-        Level.
-    residuals_of : callable, optional
-        See `study_laws`.
-
-    Returns
-    -------
-    tuple of TestResult
-
-    Raises
-    ------
-    UsageError
-        If the errors have no variance or `residuals_of` changes the shape.
-
-    Notes
-    -----
-    Up to 1000 values the replicas have as many values, beyond it 300: D sqrt(n), W^2 and A^2 differ there from their limits by some tenths
-    of a percent (M. A. Stephens, J. Am. Stat. Ass. 69 (1974) 730-737), far less than the error of 999 replicas.
-
-    Examples
-    --------
-    >>> x = np.random.default_rng(4).laplace(size=200)
-    >>> [t.rejected for t in empirical_tests(x, fit(x, "normal"), replicas=199)]
-    [True, True, True]
-    """
-    x = np.asarray(values, dtype=float)
-    n, d = len(x), found.distribution
-    m = n if residuals_of is not None or n <= EXACT else SIMULATED
-    member = find_law(found.law)
-    given = {k: v for k, v in found.parameters.items() if k not in found.estimated and k in member.parameter_names}
-    unit = float(np.sqrt(d._moments(*d.shape_values)[1]))
-    if residuals_of is not None and not np.isfinite(unit):
-        raise UsageError(f"errors of law {found.law} have no variance: they cannot be mapped to residuals")
-    children = np.random.SeedSequence(seed).spawn(replicas)
-    width = max(1, _CHUNK // m)
-    parts: list[Floats] = []
-    for start in range(0, replicas, width):
-        z = np.stack([d._rvs(np.random.default_rng(c), m, *d.shape_values) for c in children[start : start + width]], axis=1)
-        columns = d.loc + d.scale * z
-        if residuals_of is not None:
-            columns = np.asarray(residuals_of(z / unit), dtype=float)
-            if columns.shape != z.shape:
-                raise UsageError(f"residuals_of maps {z.shape} to {columns.shape}; it must keep the shape")
-        # data of the same size take part in the same search, as an exact test demands
-        parts.append(_of_columns(member, np.column_stack([x, columns]) if not parts and m == n else columns, d, given))
-    drawn = np.concatenate(parts, axis=1)
-    if m == n:
-        own, null = drawn[:, 0], drawn[:, 1:]
-    else:
-        ordered = np.sort(x)
-        own = np.array(empirical_statistics(np.asarray(d.cdf(ordered)), np.asarray(d.sf(ordered))))
-        null = drawn * np.array([[np.sqrt(m / n)], [1.0], [1.0]])
-    estimated = f" (fitted: {', '.join(found.estimated)})" if found.estimated else ""
-    return tuple(
-        TestResult(
-            name,
-            f"The values follow the {found.law.replace('_', ' ')} law{estimated}.",
-            float(own[i]),
-            SimulatedLaw(np.sort(null[i])),
-            f"simulated, B = {replicas}",
-            alpha,
-            note=_bootstrap_note(m, n, seed, residuals_of, found),
-        )
-        for i, name in enumerate(STATISTICS)
-    )
-
-
-def _of_columns(member: Law, columns: Floats, start: Distribution, given: dict[str, float]) -> Floats:
-    """The three statistics of each column, its parameters fitted anew: (3, B)."""
-    ordered = np.sort(columns, axis=0)
-    parameters, _ = refit_columns(member, ordered, start, given)
-    cls: Any = member.distribution
-    z = (ordered - parameters["loc"]) / parameters["scale"]
-    shapes = tuple(parameters[s.name] for s in cls.shapes)
-    return np.array(empirical_statistics(columnwise(cls._cdf, cls, z, shapes), columnwise(cls._sf, cls, z, shapes)))
-
-
-def _bootstrap_note(m: int, n: int, seed: int, residuals_of: ResidualsOf | None, found: Fit) -> str:
-    if residuals_of is not None:
-        kind = "approximate, since a shape is fitted" if set(found.estimated) - {"loc", "scale"} else "exact for the normal law"
-        return f"Parametric bootstrap through the design matrix, seed {seed}: {kind}."
-    size = "" if m == n else f" with samples of {m} values"
-    return f"Parametric bootstrap{size} for independent values, seed {seed}: approximate for residuals of an adjustment."
 
 
 def _modulated(x: Floats, made: LawsStudied, o: StudyOptions, replicas: int, residuals_of: ResidualsOf | None) -> LawsStudied:
@@ -449,13 +383,13 @@ def _modulated(x: Floats, made: LawsStudied, o: StudyOptions, replicas: int, res
         if replicas and (len(x) <= EXACT or residuals_of is not None):
             ratio = normal_against_modulated(x, loc=o.loc, replicas=replicas, seed=o.seed, residuals_of=residuals_of, alpha=o.alpha)
         elif replicas:
-            ratio = _ratio_of_many(normal, wide, o)
+            ratio = ratio_of_many(normal, wide, o)
     except UsageError as error:
         return replace(made, left_out=(*made.left_out, ("normal against modulated", str(error))))
     return replace(made, ratio=ratio, modulated=wide, interval=interval)
 
 
-def _ratio_of_many(normal: Fit, wide: Fit, o: StudyOptions) -> TestResult:
+def ratio_of_many(normal: Fit, wide: Fit, o: StudyOptions) -> TestResult:
     """The likelihood ratio of many values under the null law of smaller samples: it depends neither on mean and scale nor, by now, on n."""
     reference = find_law("normal")().ppf((np.arange(SIMULATED) + 0.5) / SIMULATED)
     small = normal_against_modulated(reference, loc=None if o.loc is None else 0.0, replicas=o.replicas, seed=o.seed, alpha=o.alpha)

@@ -16,11 +16,15 @@ from baarda.distributions.histogram import count
 from baarda.errors import UsageError
 from baarda.hypotheses.base import TestResult
 from baarda.hypotheses.moments import kurtosis_of_residuals, mean_of_residuals, skewness_of_residuals
+from baarda.hypotheses.normality import jarque_bera
 from baarda.hypotheses.variance_factor import global_variance_factor
 from baarda.procedures.group_study import UNCONTROLLED, Groups, coded, study_groups
-from baarda.procedures.law_study import LawsStudied, ResidualsOf, StudyOptions, class_limits, study_laws
+from baarda.procedures.law_bootstrap import ResidualsOf
+from baarda.procedures.law_study import LawsStudied, StudyOptions, class_limits, study_laws
 
 LEAST = 3
+_LEAST_JARQUE_BERA = 8
+_SIMULATED = 4e7  # values for the null law of Jarque and Bera; beyond it is asymptotic
 _ROUNDING = 1e-9  # of redundancy numbers that another program printed
 
 Kind = Literal["raw", "weighted", "standardised"]
@@ -83,7 +87,7 @@ class ResidualStudy:
     sigma0 : float or None
         A-posteriori standard deviation of unit weight.
     tests : tuple of TestResult
-        Global test (with sigmas and redundancy numbers), mean, skewness, kurtosis.
+        Global test (with sigmas and redundancy numbers), mean, skewness, kurtosis, Jarque-Bera.
     groups : Groups or None
     scale_rules : tuple of ScaleRule
     laws : LawsStudied
@@ -91,6 +95,8 @@ class ResidualStudy:
         Approximate a of the errors behind modulated residuals; description only.
     left_out : tuple of (str, str)
         What could not be done, and why.
+    count : int
+        Number of values where `values` are but representatives of a long column; 0 where they are all there is.
     """
 
     options: StudyOptions
@@ -110,11 +116,12 @@ class ResidualStudy:
     laws: LawsStudied
     a_of_errors: float | None
     left_out: tuple[tuple[str, str], ...]
+    count: int = 0
 
     @property
     def n(self) -> int:
         """The number of values studied."""
-        return len(self.values)
+        return self.count or len(self.values)
 
     def test(self, name: str) -> TestResult | None:
         """Return the test of this name."""
@@ -210,7 +217,7 @@ def study(
     if codes is not None:
         grouped, why = study_groups(codes[kept], names, base, x, own, o)
         left_out += why
-    rules, why = _scale_rules(base, x if own is not None else None, total, o)
+    rules, why = scale_rules(base, x if own is not None else None, total, o)
     left_out += why
     # Class limits are given in the unit of the residuals; standardised ones have their own.
     for_laws = replace(o, classes="equal_width", ends="open") if own is not None and not isinstance(o.classes, str) else o
@@ -313,13 +320,43 @@ def _tests(x: Floats, base: Floats, total: float | None, o: StudyOptions) -> tup
             out.append(test(centred, o.alpha, note=note))
         else:
             left_out.append((f"test of the {what}", f"it needs at least {least} values"))
+    if len(x) >= _LEAST_JARQUE_BERA:
+        how = f"Null law by {o.replicas} simulated samples of independent normal values, seed {o.seed}."
+        out.append(jarque_bera(centred, o.alpha, replicas=o.replicas, seed=o.seed, note=how if len(x) * o.replicas <= _SIMULATED else note))
     return tuple(out), left_out
 
 
-def _scale_rules(
+def scale_rules(
     base: Floats, standardised: Floats | None, total: float | None, o: StudyOptions
 ) -> tuple[tuple[ScaleRule, ...], list[tuple[str, str]]]:
-    """The normal law with the paper's four scales, on the same classes (Q_v on classes of its own values)."""
+    """Judge the normal law with the paper's four scales, on the same classes (Q_v on classes of its own values).
+
+    Parameters
+    ----------
+    base : (n,) array
+        Raw or weighted residuals.
+    standardised : (n,) array or None
+        The same divided by their own standard deviations: for Q_v.
+    total : float or None
+        Sum of their redundancy numbers: for S_o.
+    o : StudyOptions
+
+    Returns
+    -------
+    rules : tuple of ScaleRule
+    left_out : list of (str, str)
+        What could not be done, and why.
+
+    Notes
+    -----
+    Maarek & Konecny, table 4.
+
+    Examples
+    --------
+    >>> rules, _ = scale_rules(np.random.default_rng(1).standard_normal(100), None, 80.0, StudyOptions(loc=0.0))
+    >>> [(r.symbol, r.rejected) for r in rules]
+    [('S_M', False), ('S_o', None), ('S_P', False)]
+    """
     n = len(base)
     mean = float(base.mean()) if o.loc is None else o.loc
     squares = float(np.sum((base - mean) ** 2))

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from baarda.adjustment import Adjustment
+from baarda.adjustment.parameter_hypotheses import Collinearity, collinearity
 from baarda.adjustment.robust import NOT_APPLICABLE
-from baarda.distributions.comparison import compare_laws
 from baarda.distributions.fitting import Fit
 from baarda.hypotheses import run
 from baarda.hypotheses.base import Evidence, TestResult
 from baarda.hypotheses.levels import Options
 from baarda.hypotheses.outliers import TauLaw, external_reliability, mdb, standardised, tau
 from baarda.network import Table
+from baarda.procedures.adjustment_laws import AdjustmentLaws, study_adjustment
+from baarda.procedures.external_reliability import external_effects
+
+if TYPE_CHECKING:
+    from baarda.procedures.strategy import Strategy
+    from baarda.procedures.variance_components import VarianceComponents
 
 Floats = NDArray[np.float64]
-FEWEST = 20  # residuals for a comparison of laws
 
 
 @dataclass(frozen=True)
@@ -34,14 +39,32 @@ class Analysis:
         Levels and choices.
     tests : tuple of TestResult
         Empty when the adjustment did not converge.
-    laws : tuple of Fit
-        Laws compared on residuals standardised by their own sigma.
+    strategy : Strategy or None
+        What procedures around the adjustment did: snooping, selection, cross-validation.
+    components : VarianceComponents or None
+        Variances of groups of observations, estimated before the adjustment.
     """
 
     adjustment: Adjustment
     options: Options
     tests: tuple[TestResult, ...]
-    laws: tuple[Fit, ...]
+    strategy: Strategy | None = None
+    components: VarianceComponents | None = None
+
+    @cached_property
+    def study(self) -> AdjustmentLaws | None:
+        """Laws of errors compared on residuals divided by their own sigmas: simulated when first asked for.
+
+        None where nothing was tested, under a law of errors, and with fewer than 20 residuals.
+        """
+        if not self.tests or self.adjustment.law is not None:
+            return None
+        return study_adjustment(self.adjustment, self.tau, self.options)
+
+    @property
+    def laws(self) -> tuple[Fit, ...]:
+        """The laws fitted to the residuals."""
+        return () if self.study is None else tuple(s.fit for s in self.study.laws.laws)
 
     @property
     def converged(self) -> bool:
@@ -56,6 +79,11 @@ class Analysis:
     def evidence(self) -> Evidence:
         """The evidence that was tested."""
         return self.adjustment.evidence
+
+    @cached_property
+    def collinearity(self) -> Collinearity | None:
+        """How well the camera parameters can be told apart; None where none is estimated."""
+        return collinearity(self.adjustment)
 
     @cached_property
     def w(self) -> Floats:
@@ -89,22 +117,19 @@ class Analysis:
         statistic, law = (self.tau, TauLaw(e.redundancy)) if o.sigma == "aposteriori" else (self.w, stats.norm())
         pv, pqvvp = _present(e.pv), _present(e.pqvvp)
         seen = np.isfinite(statistic)
+        smallest = mdb(share / np.where(seen, pqvvp, 1.0), share, e.sigma0_apriori, o.alpha_outlier, o.power)
+        effects = external_effects(self.adjustment, smallest)
         more = {
             "w": self.w,
             "tau": self.tau,
-            "mdb": mdb(share / np.where(seen, pqvvp, 1.0), share, e.sigma0_apriori, o.alpha_outlier, o.power),
+            "mdb": smallest,
             "external": external_reliability(np.where(np.abs(share - 1.0) < 1e-12, 1.0, share), o.alpha_outlier, o.power),
             "estimated_error": np.divide(-pv, pqvvp, out=np.full(len(pv), np.nan), where=seen),
             "p_value": 2.0 * np.asarray(law.sf(np.abs(statistic))),
+            "effect": effects.values,
+            "effect_on": effects.names,
         }
         return Table({**self.adjustment.observations.columns, **more}, self.adjustment.observations.units)
-
-    @cached_property
-    def law_values(self) -> Floats:
-        """Residuals on which laws are compared: those of image points (of all observations, if there are none), divided by their sigmas."""
-        values = self.tau
-        images = np.isfinite(values) & (np.asarray(self.evidence.images) >= 0)
-        return values[images] if images.sum() >= FEWEST else values[np.isfinite(values)]
 
     @cached_property
     def suspected(self) -> NDArray[np.intp]:
@@ -143,18 +168,11 @@ def analyse(adjustment: Adjustment, options: Options | None = None) -> Analysis:
     """
     options = Options() if options is None else options
     if adjustment.status != "converged":
-        return Analysis(adjustment, options, (), ())
+        return Analysis(adjustment, options, ())
     evidence = adjustment.evidence
     applicable = NOT_APPLICABLE if adjustment.law is not None else {}
     tests = tuple(t for t in run(evidence, options) if t.name not in applicable)
-    result = Analysis(adjustment, options, tests, ())
-    return Analysis(adjustment, options, tests, _laws(result))
-
-
-def _laws(analysis: Analysis) -> tuple[Fit, ...]:
-    """Compare laws on standardised residuals, where there are enough."""
-    values = analysis.law_values
-    return compare_laws(values, loc=0.0, scale=1.0, alpha=analysis.options.alpha) if len(values) >= FEWEST else ()
+    return Analysis(adjustment, options, tests)
 
 
 def test(adjustment: Adjustment, **options: Any) -> list[TestResult]:

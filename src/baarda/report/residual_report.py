@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 import baarda
-from baarda.errors import MissingExtra, UsageError
+from baarda.errors import InputError, MissingExtra, UsageError
 from baarda.formats import digest
 from baarda.formats.folder import Mark, check_target, whole_folder
+from baarda.formats.long_column import open_long
 from baarda.formats.residual_table import ResidualTable, read
+from baarda.formats.value_stream import ParquetStream, ValueStream
 from baarda.hypotheses.base import TestResult
 from baarda.network import Table
-from baarda.procedures.law_study import LawStudy, StudyOptions
-from baarda.procedures.residual_study import ResidualStudy, ScaleRule, study
+from baarda.procedures.law_study import StudyOptions
+from baarda.procedures.long_study import study_long
+from baarda.procedures.residual_study import ResidualStudy, study
 from baarda.report import page
+from baarda.report.laws_json import law_json, scale_rule_json
 from baarda.report.residual_sections import sections
 from baarda.report.residual_verdict import sentences
 from baarda.report.result_folder import plain, table_csv
@@ -48,8 +52,11 @@ def run(
     redundancy: str | None = None,
     tables: str = "csv",
     facts: Mapping[str, Any] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Outcome:
     """Read a table of residuals, study it, and write the result folder.
+
+    A plain column of five million values or more in an NPY or Parquet file is read as a stream, in constant memory.
 
     Parameters
     ----------
@@ -64,6 +71,8 @@ def run(
         Format of the tables of the folder.
     facts : mapping, optional
         What differs from run to run (timings), for `run.json`.
+    progress : callable, optional
+        Called with the numbers of values read and in all, while a long column is read.
 
     Returns
     -------
@@ -82,12 +91,40 @@ def run(
         raise UsageError(f"tables are csv or parquet, not {tables!r}")
     if out is not None:
         check_target(Path(out), MARK)
-    table = read(path, column, group, sigma, redundancy)
-    found = study(table.values, table.groups, table.sigmas, table.redundancy_numbers, options, group_names=table.group_names)
+    o = StudyOptions() if options is None else options
+    long = open_long(path, column, group, sigma, redundancy) if isinstance(o.classes, str) else None
+    if long is not None:
+        table, found = _streamed(path, *long, o, progress)
+    else:
+        table, found = _in_memory(path, (column, group, sigma, redundancy), o)
     document = result_json(table, found)
     if out is not None:
         write_folder(table, found, out, tables, facts)
     return Outcome(found, verdict(table, found), document)
+
+
+def _in_memory(path: str | Path, columns: tuple[str | None, ...], o: StudyOptions) -> tuple[ResidualTable, ResidualStudy]:
+    table = read(path, *columns)
+    return table, study(table.values, table.groups, table.sigmas, table.redundancy_numbers, o, group_names=table.group_names)
+
+
+def _streamed(
+    path: str | Path, stream: ValueStream, column: str, o: StudyOptions, progress: Callable[[int, int], None] | None
+) -> tuple[ResidualTable, ResidualStudy]:
+    told = None if progress is None else lambda done: progress(done, stream.total)
+    try:
+        found = study_long(stream, o, progress=told)
+    except UsageError as error:
+        raise InputError(str(error), Path(path)) from None
+    assumptions = [
+        f"The column of {stream.total} values was read as a stream and condensed into bins of 1/64 octave of the distance from their mean: "
+        "class limits lie between bins, statistics of the distribution function are taken at the limits of the bins.",
+        f"Figures show {len(found.values)} representative values.",
+    ]
+    if stream.column is None:
+        assumptions.insert(0, "The array has no names: its columns are numbered from 1.")
+    name: Literal["parquet", "npy"] = "parquet" if isinstance(stream, ParquetStream) else "npy"
+    return ResidualTable(str(path), name, column, found.values, assumptions=tuple(assumptions)), found
 
 
 def verdict(table: ResidualTable, found: ResidualStudy) -> list[str]:
@@ -160,8 +197,8 @@ def result_json(table: ResidualTable, found: ResidualStudy) -> dict[str, Any]:
             "sigma0": found.sigma0,
         },
         "tests": [_test(t) for t in every],
-        "scale_rules": [_scale_rule(r) for r in found.scale_rules],
-        "laws": [_law(found, s) for s in found.laws.laws],
+        "scale_rules": [scale_rule_json(r) for r in found.scale_rules],
+        "laws": [law_json(found.laws, s) for s in found.laws.laws],
         "modulated_normal": _modulated(found),
         "chi_square_ratios": {"descriptive": True, "values": found.laws.chi_square_ratios},
         "left_out": [{"what": what, "why": why} for what, why in found.left_out],
@@ -186,30 +223,6 @@ def _test(t: TestResult) -> dict[str, Any]:
     else:
         out |= {"statistic": t.statistic, "p_value": t.p_value, "rejected": t.rejected}
     return {**out, "note": t.note} if t.note else out
-
-
-def _scale_rule(r: ScaleRule) -> dict[str, Any]:
-    f = r.fit
-    return {
-        "rule": r.name,
-        "symbol": r.symbol,
-        "mean": r.mean,
-        "standard_deviation": r.deviation,
-        "statistic": None if f is None else f.statistic,
-        "df": None if f is None else f.df,
-        "critical": None if f is None or r.described else f.critical,
-        "p_value": r.p_value,
-        "rejected": r.rejected,
-        "descriptive": r.described,
-    }
-
-
-def _law(found: ResidualStudy, s: LawStudy) -> dict[str, Any]:
-    f = s.fit
-    tests = {t.name: {"statistic": t.statistic, "critical": t.critical, "p_value": t.p_value, "rejected": t.rejected} for t in s.tests}
-    more = {"estimated": list(f.estimated), "standard_errors": dict(f.standard_errors), "at_bounds": list(f.at_bounds)}
-    decision = {"judged_by": found.laws.judged_by(s), "decision": found.laws.rejected(s)}
-    return {**f.as_dict(), **more, "notes": list(f.notes), "distribution_tests": tests, **decision}
 
 
 def _modulated(found: ResidualStudy) -> dict[str, Any] | None:

@@ -14,13 +14,15 @@ import numpy as np
 
 import baarda
 from baarda.adjustment import Adjustment
+from baarda.adjustment.parameter_hypotheses import Collinearity
 from baarda.errors import MissingExtra
 from baarda.formats.folder import Mark, whole_folder
 from baarda.formats.project import write as write_project
 from baarda.hypotheses.base import TestResult
 from baarda.network import Table
-from baarda.observations import Direct, ImagePoints
+from baarda.observations import Direct, ImageCoordinates, ImagePoints
 from baarda.procedures.testing import Analysis
+from baarda.report.laws_json import critical_json, laws_json, study_json
 
 SCHEMA = "baarda.result/1"
 MARK = Mark("result.json", "baarda.result/", ("report.html", "result.json", "run.json", "tables", "figures", "project"))
@@ -43,7 +45,7 @@ def plain(value: Any) -> Any:
 
 def result_json(analysis: Analysis) -> dict[str, Any]:
     """Return the content of `result.json` (contract, section 2)."""
-    a, o = analysis.adjustment, analysis.options
+    a, o, chosen = analysis.adjustment, analysis.options, analysis.strategy
     net = a.network
     roles = net.points.roles[~a.aside]
     used = o.sigma if analysis.converged else "apriori"
@@ -63,7 +65,7 @@ def result_json(analysis: Analysis) -> dict[str, Any]:
         for k, (n, v) in enumerate(zip(c.model.order, c.values, strict=True))
         if c.states[k] == 0
     ]
-    image_rows = [isinstance(g, ImagePoints) for g in a.groups]
+    image_rows = [isinstance(g, (ImageCoordinates, ImagePoints)) for g in a.groups]
     document = {
         "schema": SCHEMA,
         "source": {"path": net.path, "format": net.format, "sha256": net.sha256},
@@ -75,7 +77,7 @@ def result_json(analysis: Analysis) -> dict[str, Any]:
             "control_points": int((roles == 1).sum()),
             "check_points": int((roles == 2).sum()),
             "observations": a.count,
-            "image_observations": sum(2 * len(g) for g, used in zip(a.groups, image_rows, strict=True) if used),
+            "image_observations": sum(len(g) * len(g.components) for g, used in zip(a.groups, image_rows, strict=True) if used),
             "unknowns": a.numbering.count,
             "datum_defect": a.datum.defect.count,
             "datum_conditions": a.datum.defect.count,
@@ -96,12 +98,19 @@ def result_json(analysis: Analysis) -> dict[str, Any]:
         "points_set_aside": [net.points.labels[i] for i in np.flatnonzero(a.aside)],
         "unknowns": camera + fixed,
         "correlations": [{"a": x, "b": y, "value": r} for x, y, r in a.camera_correlations()] if analysis.converged else [],
+        **_collinearity(analysis.collinearity if analysis.converged else None),
         "tests": [_test(t) for t in analysis.tests],
-        "laws": [f.as_dict() for f in analysis.laws],
+        "laws": laws_json(analysis.study),
+        "law_study": study_json(analysis.study),
+        "critical_values": critical_json(analysis.study),
         "outliers": _outliers(analysis) if analysis.converged else [],
-        "selection": [],
+        "selection": [] if chosen is None or chosen.selection is None else [step.as_dict() for step in chosen.selection.steps],
+        "snooping": None if chosen is None or chosen.snooping is None else chosen.snooping.as_dict(),
+        "cross_validation": None if chosen is None or chosen.cross_validation is None else chosen.cross_validation.as_dict(),
+        "strategy": [] if chosen is None else [vars(stage) for stage in chosen.stages],
+        "variance_components": None if analysis.components is None else analysis.components.as_dict(),
         "check_points": _check_points(analysis) if analysis.converged else [],
-        "rms": _rms(a),
+        "rms": _rms(a) | {"check_intervals": _intervals(analysis)},
         "software": {
             "name": "baarda",
             "version": baarda.__version__,
@@ -111,6 +120,34 @@ def result_json(analysis: Analysis) -> dict[str, Any]:
         },
     }
     return dict(plain(document))
+
+
+def observation_table(analysis: Analysis) -> Table:
+    """Return the observation table with a column `status`: used, or rejected; what snooping rejected comes last."""
+    table = analysis.observations if analysis.converged else analysis.adjustment.observations
+    columns = {**table.columns, "status": np.full(len(table), "used", dtype=object)}
+    s = analysis.strategy
+    out = None if s is None or s.snooping is None else s.snooping.removed
+    if out is not None:
+        k = len(out)
+        rejected = {**out.columns, "status": np.full(k, "rejected", dtype=object)}
+        columns = {
+            name: np.concatenate([v, rejected.get(name, np.full(k, np.nan) if v.dtype.kind == "f" else np.full(k, "", dtype=object))])
+            for name, v in columns.items()
+        }
+    return Table(columns, table.units)
+
+
+def _collinearity(c: Collinearity | None) -> dict[str, Any]:
+    """Variance inflation of each camera parameter with its most correlated unknown, and the condition indices."""
+    if c is None:
+        return {"variance_inflation": [], "condition_indices": []}
+    mutual = [None] * len(c.names) if c.mutual is None else c.mutual.tolist()
+    rows = [
+        {"name": n, "inflation": v, "by_camera_parameters": m, "most_correlated": other, "correlation": rho}
+        for n, v, m, (other, rho) in zip(c.names, c.inflation.tolist(), mutual, c.partners, strict=True)
+    ]
+    return {"variance_inflation": rows, "condition_indices": [] if c.conditions is None else c.conditions.indices}
 
 
 def _scipy_version() -> str:
@@ -132,6 +169,8 @@ def _test(t: TestResult) -> dict[str, Any]:
             out |= {"statistic": statistic[i], "p_value": p[i], "labels": [t.labels[i]] if t.labels else []}
         else:
             out |= {"statistic": None, "p_value": None, "labels": []}
+    elif not t.details.get("applicable", True):
+        out |= {"critical": None, "statistic": None, "p_value": None, "rejected": False, "applicable": False}
     else:
         out |= {"statistic": t.statistic, "p_value": t.p_value, "rejected": t.rejected}
         if t.labels:
@@ -196,6 +235,16 @@ def _rms(a: Adjustment) -> dict[str, Any]:
     return out
 
 
+def _intervals(analysis: Analysis) -> dict[str, Any]:
+    """Return the 95 % intervals of the root mean squares of check points, and what was predicted."""
+    found = analysis.tests_named("check_axis")
+    if not found:
+        return {}
+    k, names = found[0].details, {"Z": "vertical", "3D": "3d"}
+    rows = zip(found[0].labels, k["points"], k["rms"], k["interval"], k["predicted"], strict=True)
+    return {names.get(n, n.lower()): {"points": c, "rms": x, "interval": i, "predicted": m} for n, c, x, i, m in rows}
+
+
 def _root(values: Any) -> float | None:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
@@ -244,7 +293,7 @@ def write_folder(analysis: Analysis, out: str | Path, tables: str = "csv", run: 
     target = Path(out)
     a, o = analysis.adjustment, analysis.options
     content = {
-        "observations": analysis.observations if analysis.converged else a.observations,
+        "observations": observation_table(analysis),
         "points": a.point_table(o.sigma),
         "images": a.image_table(o.sigma),
         "unknowns": a.unknown_table(o.sigma),

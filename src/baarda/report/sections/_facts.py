@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from baarda.cameras import FIXED
 from baarda.hypotheses.base import TestResult
 from baarda.network import AXES, CONTROL
-from baarda.observations import Direct, ImagePoints
+from baarda.observations import Direct, ImageCoordinates, ImagePoints
 from baarda.procedures.testing import Analysis
 
 Floats = NDArray[np.float64]
@@ -43,7 +43,7 @@ def judge(analysis: Analysis) -> tuple[str, Floats, float]:
 def image_rows(analysis: Analysis) -> NDArray[np.bool_]:
     """Return which scalar observations are image coordinates."""
     a = analysis.adjustment
-    return np.concatenate([np.full(len(g) * len(g.components), isinstance(g, ImagePoints)) for g in a.groups])
+    return np.concatenate([np.full(len(g) * len(g.components), isinstance(g, (ImageCoordinates, ImagePoints))) for g in a.groups])
 
 
 def unit_of(analysis: Analysis, row: int) -> str:
@@ -65,7 +65,7 @@ def label_of(analysis: Analysis, row: int) -> str:
     a, table = analysis.adjustment, analysis.observations
     g = int(np.searchsorted(a.offsets, row, side="right")) - 1
     image, point = table["image"][row], table["point"][row]
-    head = "" if isinstance(a.groups[g], ImagePoints) else f"{table['group'][row]},"
+    head = "" if isinstance(a.groups[g], (ImageCoordinates, ImagePoints)) else f"{table['group'][row]},"
     parts = (head, f"image {image}" if image else "", f"point {point}" if point else "", str(table["component"][row]))
     return " ".join(part for part in parts if part)
 

@@ -31,6 +31,8 @@ def _short(value: float) -> str:
 def _row(test: TestResult, mark: str) -> tuple[str | Cell, ...]:
     """One row: a single test, or the extreme member of a family with the count beyond the limit."""
     head, level = f"{test.name.replace('_', ' ')}\n{test.null}{mark}", f"{test.alpha:.3g}"
+    if not test.details.get("applicable", True):
+        return (head, Cell("not applicable", "info"), "", "", "", level, "", "")
     if not np.ndim(test.statistic):
         decision = Cell("rejected" if test.rejected else "not rejected", _tone(test, bool(test.rejected), "bad"))
         label = test.labels[0] if len(test.labels) == 1 else ""

@@ -6,13 +6,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from baarda.hypotheses.base import Estimates, TestResult
 from baarda.network import AXES
 from baarda.procedures.testing import Analysis
 from baarda.report.sections._facts import MOST_ROWS, first, result_of, scaling
-from baarda.report.sections._numbers import MISSING, decimals_for, finer, fixed, probability, significant
+from baarda.report.sections._numbers import MISSING, decimals_for, finer, fixed, plural, probability, significant
 from baarda.report.sections.base import Block, Cell, Column, DataTable, SectionMaker, Tone, say
 
 Floats = NDArray[np.float64]
@@ -66,44 +65,79 @@ def _differences(analysis: Analysis, kind: str, e: Estimates, deviations: Floats
     return DataTable(caption, columns, tuple(rows), " ".join(n for n in note if n))
 
 
-def _accuracy(analysis: Analysis, e: Estimates, predicted: Floats) -> DataTable:
-    """RMSE of the check points with its interval, beside what the adjustment predicts."""
-    unit = analysis.adjustment.network.unit
-    d = np.stack([v for v, _ in _by_point(e, predicted).values()])
-    s = np.stack([v for _, v in _by_point(e, predicted).values()])
-    told, factor = finer(unit, d)
-    decimals = decimals_for(np.abs(d[np.isfinite(d)]) * factor, 3)
-    rows: list[tuple[str, ...]] = []
-    sets: list[tuple[str, list[int]]] = [(axis, [k]) for k, axis in enumerate(AXES)]
-    sets += [("horizontal", [0, 1]), ("3D", [0, 1, 2])]
-    for name, axes in sets:
-        whole = np.isfinite(d[:, axes]).all(axis=1)
-        n = int(whole.sum())
-        if not n:
-            continue
-        values, sigma = d[whole][:, axes], s[whole][:, axes]
-        rmse = float(np.sqrt((values**2).sum(axis=1).mean()))
-        expected = float(np.sqrt((sigma**2).sum(axis=1).mean()))
-        cells = [name, str(n), fixed(float(values.mean()) * factor, decimals) if len(axes) == 1 else "", fixed(rmse * factor, decimals)]
-        if len(axes) == 1:
-            low, high = np.sqrt(n / stats.chi2.ppf([0.975, 0.025], n))
-            cells.append(f"{fixed(rmse * low * factor, decimals)}..{fixed(rmse * high * factor, decimals)}")
-        else:
-            cells.append("")
-        rows.append((*cells, fixed(expected * factor, decimals), significant(rmse / expected, 3) if expected > 0.0 else MISSING))
+def _accuracy(analysis: Analysis) -> list[Block]:
+    """RMSE of the check points by axis with its interval, beside what the adjustment predicts, and the test of each axis."""
+    test = result_of(analysis, "check_axis")
+    if test is None:
+        return []
+    unit, k = analysis.adjustment.network.unit, test.details
+    told, factor = finer(unit, k["rms"])
+    decimals = decimals_for(np.array(k["rms"]) * factor, 3)
+    p, rejected = np.asarray(test.p_value), np.asarray(test.rejected)
+    rows: list[tuple[str | Cell, ...]] = []
+    for i, name in enumerate(test.labels):
+        low, high = k["interval"][i]
+        ratio = k["rms"][i] / k["predicted"][i] if k["predicted"][i] > 0.0 else float("nan")
+        numbers = (
+            name,
+            str(k["points"][i]),
+            "" if k["mean"][i] is None else fixed(k["mean"][i] * factor, decimals),
+            fixed(k["rms"][i] * factor, decimals),
+            f"{fixed(low * factor, decimals)}..{fixed(high * factor, decimals)}",
+            fixed(k["predicted"][i] * factor, decimals),
+            significant(ratio, 3) if np.isfinite(ratio) else MISSING,
+            fixed(float(np.asarray(test.statistic)[i]), 2),
+            probability(float(p[i])),
+        )
+        rows.append((*numbers, Cell("rejected", "warn") if rejected[i] else Cell("agrees", "good")))
     columns = (
-        Column("of", "", "", "left"),
+        Column("of", "", "Z is the vertical; horizontal and 3D per point", "left"),
         Column("points", "", "number of check points"),
         Column("mean", told, "mean difference: a systematic part"),
-        Column("RMSE", told, "root mean square of the differences adjusted - given"),
-        Column("95 % interval", told, "of the RMSE, from so many points: RMSE sqrt(n / chi-square)"),
+        Column("RMSE", told, "root mean square of the differences adjusted - given, per point"),
+        Column("95 % interval", told, "of the RMSE, from so many points with their predicted correlations"),
         Column("predicted", told, "root mean square of the predicted standard deviations, adjustment and survey"),
         Column("RMSE / predicted", "", "1 = as accurate as predicted"),
+        Column("T", "", "test statistic of these coordinates together, per coordinate"),
+        Column("p", "", "probability of a T as large"),
+        Column("decision", "", "", "left"),
     )
-    note = "The interval assumes independent normal errors."
-    if len(d) < 30:
-        note += " " + say("Fewer than 30 check points ({count}): the ASPRS standards (2nd edition) ask to say so.", count=len(d))
-    return DataTable("Accuracy from check points", columns, tuple(rows), note)
+    count = max(k["points"])
+    note = ""
+    if count < 3:
+        note = say("{count}: no statement about the whole block can rest on so few.", count=plural(count, "check point"))
+    elif count < 30:
+        note = say("Fewer than 30 check points ({count}): the ASPRS standards (2nd edition) ask to say so.", count=count)
+    return [DataTable("Accuracy from check points", columns, tuple(rows), note)]
+
+
+def _prior_and_posterior(analysis: Analysis, e: Estimates) -> list[Block]:
+    """Control coordinates: what was given, what the adjustment adds, and how much of an error would show."""
+    if e.reference_covariance is None:
+        return []
+    scale = analysis.adjustment.scale(analysis.options.sigma)
+    prior, qvv = np.diag(e.reference_covariance), np.diag(e.cofactors)
+    posterior = prior - qvv
+    by_prior, by_posterior = (_by_point(e, scale * np.sqrt(np.maximum(q, 0.0))) for q in (prior, posterior))
+    shares = _by_point(e, qvv / prior)
+    unit, factor = finer(analysis.adjustment.network.unit, np.sqrt(prior) * scale)
+    decimals = decimals_for(np.sqrt(prior) * scale * factor, 3)
+    rows: list[tuple[str | Cell, ...]] = []
+    for label in list(by_prior)[:MOST_ROWS]:
+        before, after = (table[label][1] * factor for table in (by_prior, by_posterior))
+        numbers = [fixed(float(v), decimals) for v in (*before, *after)]
+        rows.append((label, *numbers, *(fixed(float(v), 3) for v in shares[label][1])))
+    columns = (
+        Column("point", "", "", "left"),
+        *(Column(f"prior s{axis}", unit, say("given standard deviation, {scaling}", scaling=scaling(analysis))) for axis in AXES),
+        *(Column(f"posterior s{axis}", unit, "of the adjusted coordinate") for axis in AXES),
+        *(
+            Column(f"r {axis}", "", "redundancy number: share of an error of the given coordinate that shows in its residual")
+            for axis in AXES
+        ),
+    )
+    note = first(len(by_prior), MOST_ROWS, "tables/observations.csv")
+    return [DataTable("Control: prior and posterior", columns, tuple(rows), note, folded=True)]
 
 
 def _joint(test: TestResult | None, words: str) -> list[Block]:
@@ -144,7 +178,7 @@ def _build(analysis: Analysis) -> list[Block] | None:
             say("predicted standard deviation of the difference, adjustment ({scaling}) and survey", scaling=scaling(analysis)),
         )
         blocks += _joint(result_of(analysis, "check_points"), "check points agree with the survey")
-        blocks.append(_accuracy(analysis, e, predicted))
+        blocks += _accuracy(analysis)
         blocks.append(_differences(analysis, "check", e, predicted, words, "result.json"))
     e = analysis.evidence.control
     if e is not None and len(e.values):
@@ -152,6 +186,7 @@ def _build(analysis: Analysis) -> list[Block] | None:
         deviations = scale * np.sqrt(np.maximum(np.diag(e.cofactors), 0.0))
         blocks += _joint(result_of(analysis, "control_points"), "control coordinates are right")
         blocks.append(_differences(analysis, "control", e, deviations, words, "tables/observations.csv"))
+        blocks += _prior_and_posterior(analysis, e)
     return blocks or None
 
 

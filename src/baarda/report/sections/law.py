@@ -1,142 +1,147 @@
-"""Residual law: which law of errors the standardised residuals follow."""
+"""Residual law: which law of errors the standardised residuals follow, and what it means for the tests of single observations."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from baarda.distributions.fitting import Fit
+from baarda.procedures.adjustment_laws import AdjustmentLaws
+from baarda.procedures.error_law import CriticalValues, Limit
 from baarda.procedures.testing import Analysis
-from baarda.report import plots
-from baarda.report.sections._facts import image_rows, result_of
-from baarda.report.sections._numbers import MISSING, fixed, plural, probability, significant
-from baarda.report.sections.base import Block, Cell, Column, DataTable, Figure, Paragraph, SectionMaker, say
-from baarda.report.sections.verdict import law_name
-
-Floats = NDArray[np.float64]
-
-
-def _values(analysis: Analysis) -> tuple[Floats, str]:
-    """Return the residuals to which the laws were fitted: those of image points, or of all observations."""
-    values = analysis.tau
-    chosen = np.isfinite(values) & image_rows(analysis)
-    if int(chosen.sum()) != analysis.laws[0].n:
-        return values[np.isfinite(values)], "all observations"
-    return values[chosen], "image coordinates"
-
-
-def _laws(analysis: Analysis, best: Fit) -> DataTable:
-    rows = []
-    for f in analysis.laws:
-        values = ", ".join(f"{k} = {significant(v, 3)}" for k, v in f.parameters.items() if k in f.estimated) or "none"
-        decision = Cell("") if f.rejected is None else Cell("rejected", "bad") if f.rejected else Cell("not rejected", "good")
-        rows.append(
-            (
-                f.law.replace("_", " ") + (" (best AIC)" if f is best else ""),
-                values,
-                fixed(f.statistic, 1),
-                MISSING if f.df is None else str(f.df),
-                fixed(f.critical, 1),
-                probability(f.p_value),
-                decision,
-                fixed(f.log_likelihood, 1),
-                fixed(f.aic, 1),
-                fixed(f.bic, 1),
-            )
-        )
-    columns = (
-        Column("law", "", "", "left"),
-        Column("estimated", "", "values found by maximum likelihood; mean 0 and standard deviation 1 are given", "left"),
-        Column("chi-square", "", "sum of (found - expected)² / expected over classes that are equally probable under the law"),
-        Column("df", "", "degrees of freedom: classes - 1 - estimated values"),
-        Column("limit", "", f"critical value at level {best.alpha:.3g}"),
-        Column("p", "", "probability of a chi-square as large if the law holds"),
-        Column("decision", "", "", "left"),
-        Column("log L", "", "logarithm of the likelihood: larger is better"),
-        Column("AIC", "", "Akaike's criterion, 2 k - 2 log L: smaller is better"),
-        Column("BIC", "", "Schwarz's criterion, k log n - 2 log L: smaller is better"),
-    )
-    note = (
-        "The p-values assume independent residuals with the standard deviation 1. Residuals of one adjustment are weakly correlated, "
-        "and values estimated from the residuals themselves make the test reject a little too often: read a p-value near the level "
-        "with care, and compare the laws by AIC."
-    )
-    return DataTable("Laws compared", columns, tuple(rows), note)
+from baarda.report.sections._facts import result_of
+from baarda.report.sections._laws import classes_table, decision, figures, laws_table, ratios_table, scale_table, table_of_tests
+from baarda.report.sections._numbers import fixed, probability, significant
+from baarda.report.sections.base import Block, Cell, Column, DataTable, Items, Paragraph, SectionMaker, say
 
 
 def _moments(analysis: Analysis) -> list[Block]:
     rows: list[tuple[str | Cell, ...]] = []
+    note = ""
     for name, key, normal in (
         ("mean_of_residuals", "mean", "0"),
         ("skewness_of_residuals", "skewness", "0"),
         ("kurtosis_of_residuals", "kurtosis", "3"),
     ):
         test = result_of(analysis, name)
-        if test is None or not isinstance(test.critical, tuple):
+        if test is None:
             continue
-        decision = Cell("rejected", "warn") if test.rejected else Cell("not rejected", "good")
         value = test.details.get(key)
-        rows.append((key, fixed(value, 4), normal, probability(float(test.p_value)), decision))
+        shown = "" if value is None else fixed(value, 4)
+        if not test.details.get("applicable", True):
+            rows.append((key, shown, normal, "", Cell("not applicable", "info")))
+            note = test.note
+        else:
+            rows.append((key, shown, normal, probability(float(test.p_value)), decision(bool(test.rejected), "warn")))
+    both = result_of(analysis, "jarque_bera")
+    if both is not None:
+        shown = fixed(float(both.statistic), 2)
+        rows.append(("Jarque-Bera", shown, "0", probability(float(both.p_value)), decision(bool(both.rejected), "warn")))
     if not rows:
         return []
     columns = (
-        Column("moment", "", "of the standardised residuals", "left"),
+        Column("moment", "", "of the standardised residuals; Jarque-Bera joins skewness and kurtosis", "left"),
         Column("found", "", "of the sample"),
         Column("normal law", "", "value under the normal law"),
-        Column("p", "", "of the two-sided test, see All tests"),
+        Column("p", "", "see All tests"),
         Column("decision", "", "", "left"),
     )
-    return [DataTable("Moments of the standardised residuals", columns, tuple(rows))]
+    return [DataTable("Moments of the standardised residuals", columns, tuple(rows), note)]
 
 
-def _build(analysis: Analysis) -> list[Block] | None:
-    laws = [f for f in analysis.laws if f.aic is not None]
-    if not laws:
-        return None
-    values, what = _values(analysis)
-    best = min(laws, key=lambda f: f.aic if f.aic is not None else np.inf)
-    beyond = int((np.abs(values) > 5.0).sum())
-    intro = say(
+def _limit(limit: Limit) -> tuple[str, str]:
+    return f"{fixed(limit.value, 2)} ± {fixed(limit.error, 2)}", fixed(limit.normal, 2)
+
+
+def _critical(found: CriticalValues) -> list[Block]:
+    a = found.law.parameters["a"]
+    if np.isinf(a):
+        text = (
+            "By the kurtosis of the residuals, traced back through Qvv, the errors are as normal as can be (a = ∞): critical values of w "
+            "and tau and the minimal detectable biases are those of the normal law."
+        )
+        return [Paragraph(text)]
+    rows: list[tuple[str | Cell, ...]] = []
+    for k, c in enumerate(found.classes):
+        own = found.members == k
+        ratio = float(np.nanmedian(found.mdb[own] / found.mdb_normal[own]))
+        span = f"{fixed(c.lowest, 3)}..{fixed(c.highest, 3)}"
+        levels = (significant(c.level_w, 2), significant(c.level_tau, 2))
+        rows.append((span, str(c.count), *_limit(c.w), *_limit(c.tau), *levels, *_limit(c.delta0), fixed(ratio, 2)))
+    n = int((found.members >= 0).sum())
+    rows.append((f"largest of all, level {found.family_alpha:.3g}", str(n), *_limit(found.family_w), *_limit(found.family_tau), *[""] * 5))
+    columns = (
+        Column(
+            "redundancy",
+            "",
+            "class of redundancy numbers: the less an observation is controlled, the more errors its residual mixes",
+            "left",
+        ),
+        Column("n", "", "observations"),
+        Column("w", "", "critical value of |w| under the law of the errors, with its simulation error"),
+        Column("w, normal", "", "the same for normal errors"),
+        Column("tau", "", "critical value of |tau| under the law of the errors"),
+        Column("tau, normal", "", "the same for normal errors"),
+        Column("level of w", "", "how often the normal critical value really rejects a good observation by w"),
+        Column("level of tau", "", "the same by tau"),
+        Column("shift", "", "of w, that is found with the power below"),
+        Column("shift, normal", "", "the same for normal errors"),
+        Column("MDB / normal", "", "minimal detectable bias relative to that of normal errors"),
+    )
+    note = say(
+        "Law of the errors: modulated normal with a = {a}, from the kurtosis of the residuals through Qvv. A residual mixes errors, and a "
+        "mixture of modulated normal errors is not modulated normal: {replicas} adjustments of such errors were simulated. Level {alpha} "
+        "for one observation, power {power}. The decisions of this report are those for normal errors.",
+        a=significant(a, 2),
+        replicas=found.replicas,
+        alpha=f"{found.alpha:g}",
+        power=fixed(found.power, 2),
+    )
+    return [DataTable("Critical values under the law of the errors", columns, tuple(rows), note)]
+
+
+def _intro(analysis: Analysis, study: AdjustmentLaws) -> str:
+    return say(
         "Each residual of {what} ({n}) was divided by its own standard deviation (tau), which makes residuals of good and weak "
         "geometry comparable. A modulated normal law with a = 1/2 is the radico, with a = 1 the lineo, with a = infinity the normal; a "
         "small a means a mixture of precisions: a sharp peak and long tails.",
-        what=what,
-        n=len(values),
+        what=study.what,
+        n=len(study.values),
     )
-    curves = [(f.law.replace("_", " "), f.distribution.pdf) for f in laws]
-    caption = say(
-        "Residuals of {what} in classes, and the density of each fitted law. {beyond}",
-        what=what,
-        beyond=say("{count} beyond ±5, counted in the outer classes.", count=plural(beyond, "value lies", "values lie")) if beyond else "",
-    ).strip()
-    alt = say(
-        "Histogram of {n} standardised residuals between -5 and 5 with the curves of {laws}; the {best} fits best by AIC.",
-        n=len(values),
-        laws=", ".join(name for name, _ in curves),
-        best=law_name(best.law, best.parameters.get("a")),
-    )
-    label = "standardised residual tau (own standard deviations)"
+
+
+def _build(analysis: Analysis) -> list[Block] | None:
+    study = analysis.study
+    if study is None or not study.laws.laws:
+        return None
+    laws = study.laws
     blocks: list[Block] = [
-        Paragraph(intro),
-        Figure("residual-law", "Histogram of the standardised residuals", caption, alt, plots.histogram(values, curves, label)),
+        Paragraph(_intro(analysis, study)),
+        *figures(laws, study.values, 0.0, 1.0, "standardised residual tau (own standard deviations)"),
+        laws_table(laws, study.options.alpha),
     ]
-    other = None if best.law == "normal" else (law_name(best.law, best.parameters.get("a")), best.distribution.ppf)
-    caption = (
-        "Sorted residuals against the quantiles of the normal law. Marks on the dashed line are normal; an S that leaves it upwards on "
-        "the right and downwards on the left has heavy tails."
-    )
-    alt = say(
-        "Normal Q-Q plot of {n} standardised residuals, from {low} to {high}.",
-        n=len(values),
-        low=fixed(values.min(), 2),
-        high=fixed(values.max(), 2),
-    )
-    blocks.append(
-        Figure(
-            "quantiles", "Q-Q plot of the standardised residuals", caption, alt, plots.quantiles(values, other, "standardised residual tau")
+    if laws.ratio is not None:
+        blocks += table_of_tests("Normal against modulated normal", (laws.ratio,))
+    if laws.modulated is not None and laws.interval is not None:
+        text = say(
+            "Among the modulated normal laws a = {a} fits the residuals best, with {level} % interval {low} to {high}{normal}.",
+            a=significant(laws.modulated.parameters["a"], 3),
+            level=f"{100 * study.options.interval:g}",
+            low=significant(laws.interval[0], 3),
+            high=significant(laws.interval[1], 3),
+            normal=", the normal law itself" if np.isinf(laws.interval[1]) else "",
         )
-    )
-    return [*blocks, _laws(analysis, best), *_moments(analysis)]
+        blocks.append(Paragraph(text))
+    if study.critical is not None:
+        blocks += _critical(study.critical)
+    blocks += _moments(analysis)
+    if study.scale_rules:
+        blocks.append(scale_table(study.scale_rules))
+    classes = classes_table(laws)
+    if classes is not None:
+        blocks.append(classes)
+    blocks += ratios_table(laws)
+    if study.left_out:
+        blocks.append(Items("Not done:", tuple(f"{what}: {why}." for what, why in study.left_out)))
+    return blocks
 
 
 LAW = SectionMaker(110, "law", "Residual law", _build)

@@ -97,6 +97,27 @@ def _gross(analysis: Analysis) -> Iterator[Problem]:
         )
 
 
+def _snooped(analysis: Analysis) -> Iterator[Problem]:
+    s = None if analysis.strategy is None else analysis.strategy.snooping
+    if s is None:
+        return
+    out = len(s.images) if s.unit == "image" else s.count
+    if out:
+        what = plural(out, "image was", "images were") if s.unit == "image" else plural(out, "observation was", "observations were")
+        evidence = say("see Data snooping; {stopped}", stopped=s.stopped)
+        advice = "They are judged by statistics alone: look at the measurements before you believe that they are wrong."
+        yield "info", say("{what} removed by data snooping.", what=what), evidence, advice
+    kept = [" ".join(t for t in (k.image, k.point, k.component) if t) for k in s.steps if k.action == "kept"]
+    if kept:
+        advice = "They cannot be removed without losing a point, an image or the datum, or cannot be told apart: measure more rays there."
+        yield (
+            "warn",
+            say("{count} suspected, but kept.", count=plural(len(kept), "observation is", "observations are")),
+            names(kept, 6),
+            advice,
+        )
+
+
 def _gathered(analysis: Analysis) -> Iterator[Problem]:
     found = clusters(analysis)
     points, images = ([c for c in found if c.kind == kind] for kind in ("point", "image"))
@@ -279,7 +300,7 @@ def _law(analysis: Analysis) -> Iterator[Problem]:
 
 
 _CHECKS: tuple[Callable[[Analysis], Iterator[Problem]], ...] = (
-    _global, _gross, _gathered, _survey, _behind, _groups, _systematic, _images, _law, _correlated, _superfluous,
+    _global, _gross, _snooped, _gathered, _survey, _behind, _groups, _systematic, _images, _law, _correlated, _superfluous,
     _uncontrolled, _weak_points, _few_rays, _aside,
 )  # fmt: skip
 

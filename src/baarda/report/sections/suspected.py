@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 
 from baarda.procedures.testing import Analysis
-from baarda.report.sections._facts import clusters, judge, result_of, unit_of
+from baarda.report.sections._facts import bare, clusters, judge, result_of, unit_of
 from baarda.report.sections._numbers import fixed, plural, powers, probability, significant
 from baarda.report.sections.base import Block, Cell, Column, DataTable, Paragraph, SectionMaker, say
 
@@ -85,6 +85,7 @@ def _build(analysis: Analysis) -> list[Block] | None:
                 significant(number["estimated_error"], 3),
                 significant(number["mdb"], 3),
                 fixed(number["external"], 2),
+                _effect(analysis, i),
                 probability(number["p_value"]),
                 *meaning,
             )
@@ -105,6 +106,7 @@ def _build(analysis: Analysis) -> list[Block] | None:
         Column("error", "", "estimated gross error, observed - true = -v / r"),
         Column("MDB", "", say("minimal detectable bias with power {power}", power=fixed(o.power, 2))),
         Column("external", "", "effect of an undetected error of that size on the unknowns, in their standard deviations at most"),
+        Column("effect", "", "the largest of these effects on an unknown of its camera, image or points, in its unit", "left"),
         Column("p", "", say("probability of a |{name}| as large without gross error", name=name)),
         Column("at point", "", "further observations suspected at the same point"),
         Column("in image", "", "further observations suspected in the same image"),
@@ -118,6 +120,12 @@ def _build(analysis: Analysis) -> list[Block] | None:
     )
     note = say("The first {most} of {count}; all are in tables/observations.csv.", most=_MOST, count=count) if count > _MOST else ""
     return [*blocks, DataTable("Suspected observations, the worst first", columns, tuple(rows), note)]
+
+
+def _effect(analysis: Analysis, row: int) -> str:
+    table = analysis.observations
+    value, name = float(table["effect"][row]), str(table["effect_on"][row])
+    return say("{value} on {name}", value=significant(value, 2), name=bare(name, analysis)) if name else ""
 
 
 def _normal_limit(alpha: float) -> float:

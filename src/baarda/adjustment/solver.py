@@ -1,0 +1,28 @@
+"""The contract that both solvers keep."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+
+class Solver(Protocol):
+    """Factored normal equations N = A'A of a whitened linear system, some unknowns held fixed."""
+
+    @property
+    def rcond(self) -> float:
+        """Reciprocal condition number of the scaled (reduced) normal matrix."""
+
+    def solve(self, rhs: Floats) -> Floats:
+        """Return N^-1 rhs for (u,) or (u, k) right-hand sides."""
+
+    def hat(self) -> list[Floats]:
+        """Return for each chunk the (N, m, m) diagonal blocks of A N^-1 A'."""
+
+    def blocks(self, columns: Ints) -> Floats:
+        """Return the (N, w, w) blocks of N^-1 for (N, w) columns; -1 = fixed, zero."""

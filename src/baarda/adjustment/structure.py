@@ -1,0 +1,498 @@
+"""What the block solver knows before any number: nodes, clusters of points, fronts, and where each row block stands in them.
+
+An object point that no observation joins to another point is eliminated first (an *inner* point). All other unknowns are nodes of the
+reduced system: cameras, images, points joined to points, stations, of any width. Inner points that see nearly the same nodes form a
+*cluster*, whose part of the reduced system is one dense matrix. Nested dissection of the nodes gives the *fronts* of a multifrontal
+factorisation (Duff & Reid 1983); a cluster belongs to the front where its first node is eliminated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+
+from baarda.adjustment.dissection import dissect
+from baarda.adjustment.linearize import Chunk, Linearization, kept_positions
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+Small = NDArray[np.int32]
+Bools = NDArray[np.bool_]
+
+BASE = 16  # points of the smallest cluster
+MOST = 1024  # points of the largest cluster
+LARGEST = 700_000  # points times columns of the largest cluster
+GROWTH = 1.1  # a cluster may grow while its width stays below this multiple of its widest part
+SPARSE = 3.5  # clusters wider than this multiple of what a point of theirs touches are treated point by point
+
+
+@dataclass(frozen=True)
+class Front:
+    """A dense part of the factor.
+
+    Attributes
+    ----------
+    begin, pivots : int
+        First eliminated column and their number, in the order of elimination.
+    columns : (n,) int array
+        All columns in the order of elimination: pivots, then the boundary.
+    parent : int
+        The front that takes the boundary, -1 = none.
+    into_parent : (n - pivots,) int array
+        Where the boundary stands in the parent.
+    children : tuple of int
+    clusters : int array
+        Its clusters.
+    """
+
+    begin: int
+    pivots: int
+    columns: Ints
+    parent: int
+    into_parent: Ints
+    children: tuple[int, ...]
+    clusters: Ints
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Row blocks of a chunk without inner point: their rows in the chunk, front, and columns (N, w) in the front, -1 = none."""
+
+    chunk: int
+    rows: Ints
+    front: Ints
+    at: Ints
+
+
+@dataclass(frozen=True)
+class Structure:
+    """The pattern of a linear system.
+
+    Attributes
+    ----------
+    order : (U,) int array
+        Unknowns of the reduced system in the order of elimination; -1 = a parameter that is fixed.
+    points : (P,) int array
+        Inner points in the order of clusters.
+    point_columns : (P, 3) int array
+        Their unknowns, -1 = fixed.
+    first_block : (P + 1,) int array
+    block_chunk, block_row : (B,) int32 arrays
+        Row blocks sorted by inner point.
+    starts : tuple of (N, parts) int32 arrays
+        For each chunk where the columns of each part begin in its cluster, -1 = not there.
+    point_part : tuple of int
+        For each chunk which part is the inner point, -1 = none.
+    first_point, first_column : (C + 1,) int arrays
+        Points and columns of each cluster.
+    cluster_columns : int array
+        Of each column of a cluster its place in the order of elimination.
+    cluster_rows : int32 array
+        Of each column of a cluster its row in the front.
+    sparse : (C,) bool array
+        Clusters whose points touch few of their columns each.
+    fronts : tuple of Front
+        Children before parents.
+    rest : tuple of Rest
+    """
+
+    order: Ints
+    points: Ints
+    point_columns: Ints
+    first_block: Ints
+    block_chunk: Small
+    block_row: Small
+    starts: tuple[Small, ...]
+    point_part: tuple[int, ...]
+    first_point: Ints
+    first_column: Ints
+    cluster_columns: Ints
+    cluster_rows: Small
+    sparse: Bools
+    fronts: tuple[Front, ...]
+    rest: tuple[Rest, ...]
+
+    @property
+    def most_rows(self) -> int:
+        """An upper bound of the row blocks of one point."""
+        return int(np.diff(self.first_block).max(initial=0))
+
+
+def rank_of_points(coordinates: Floats) -> Ints:
+    """Return the rank of each point along a space-filling curve (Morton 1966), points without coordinates last.
+
+    Parameters
+    ----------
+    coordinates : (n, 3) array
+        Approximate coordinates; NaN = unknown.
+
+    Returns
+    -------
+    (n,) int array
+
+    Examples
+    --------
+    >>> rank_of_points(np.array([[0.0, 0.0, 0.0], [9.0, 9.0, 0.0], [1.0, 0.0, 0.0]]))
+    array([0, 2, 1])
+    """
+    known = np.isfinite(coordinates).all(axis=1)
+    key = np.full(len(coordinates), np.iinfo(np.int64).max)
+    if known.any():
+        x = coordinates[known]
+        size = np.maximum(np.quantile(x, 0.99, axis=0) - np.quantile(x, 0.01, axis=0), 1e-300)
+        low = np.quantile(x, 0.01, axis=0)
+        # one scale for all axes, so that cells are cubes and the relief of flat objects does not count
+        cells = np.floor(np.clip((x - low) / size.max(), 0.0, 1.0) * (2**20 - 1)).astype(np.int64)
+        key[known] = sum(_spread(cells[:, k]) << k for k in range(3))
+    rank = np.empty(len(key), dtype=np.intp)
+    rank[np.argsort(key, kind="stable")] = np.arange(len(key))
+    return rank
+
+
+def _spread(x: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Put two zero bits between the bits of 20-bit numbers."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        x = (x | (x << shift)) & mask
+    return x
+
+
+def analyse(lin: Linearization, rank: Ints, coordinates: Floats) -> Structure:
+    """Analyse the pattern of a linear system.
+
+    Parameters
+    ----------
+    lin : Linearization
+        Its chunks and nodes count, not its values.
+    rank : (points,) int array
+        Points of neighbouring rank should be seen by the same images.
+    coordinates : (points, 3) array
+        Approximate, by which images are placed for the dissection.
+
+    Returns
+    -------
+    Structure
+    """
+    inner = inner_points(lin)
+    nodes = _Nodes.of(lin, inner)
+    points = np.flatnonzero(inner)
+    points = points[np.argsort(rank[points], kind="stable")]
+    place = np.full(len(inner), -1)
+    place[points] = np.arange(len(points))
+
+    part = tuple(_point_part(c, inner) for c in lin.chunks)
+    owner = [place[c.parts[j].nodes] if j >= 0 else np.full(len(c.first), -1) for j, c in zip(part, lin.chunks, strict=True)]
+    first_block, chunk, row = _blocks_by_point(owner, len(points))
+    seen = [nodes.of_chunk(c) for c in lin.chunks]  # (N, parts) nodes of each row block
+    first_point, members, sparse = _clusters(first_block, chunk, row, seen, nodes)
+    rest = [(i, np.flatnonzero(o < 0)) for i, o in enumerate(owner) if (o < 0).any()]
+    cliques = [*members, *(m for i, rows in rest for m in _distinct(seen[i][rows]))]
+    centres = _centres(coordinates[points], first_point)
+    parts = dissect(_graph(cliques, nodes.count), nodes.places(members, centres))
+
+    elimination = np.concatenate([np.zeros(0, dtype=np.intp), *parts])
+    position = np.empty(nodes.count, dtype=np.intp)
+    position[elimination] = np.arange(nodes.count)
+    front_of = np.empty(nodes.count, dtype=np.intp)
+    front_of[elimination] = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
+    begin = np.empty(nodes.count, dtype=np.intp)
+    begin[elimination] = np.cumsum(nodes.width[elimination]) - nodes.width[elimination]
+
+    members = [m[np.argsort(position[m])] for m in members]
+    home = np.array([front_of[m[0]] if len(m) else -1 for m in members], dtype=np.intp)
+    front_nodes = _nodes_of_fronts(parts, cliques, position, front_of)
+    fronts = _fronts(parts, front_nodes, home, nodes, begin, front_of)
+    rows_in = _RowsInFronts(front_nodes, nodes)
+    widths = [nodes.width[m] for m in members]
+    first_column = np.concatenate([[0], np.cumsum([int(w.sum()) for w in widths])]).astype(np.intp)
+    return Structure(
+        order=_joined([nodes.columns_of(n) for n in elimination]),
+        points=points,
+        point_columns=lin.unknowns["point"].columns.reshape(-1, 3)[points],
+        first_block=first_block,
+        block_chunk=chunk,
+        block_row=row,
+        starts=tuple(_starts(seen, part, chunk, row, first_block[first_point], members, widths, nodes.count)),
+        point_part=part,
+        first_point=first_point,
+        first_column=first_column,
+        cluster_columns=_joined([_ranges(begin[m], w) for m, w in zip(members, widths, strict=True)]),
+        cluster_rows=_joined([_ranges(rows_in(f, m), w) for m, w, f in zip(members, widths, home, strict=True)]).astype(np.int32),
+        sparse=sparse,
+        fronts=fronts,
+        rest=tuple(_rest(i, rows, seen[i][rows], lin.chunks[i], position, front_of, rows_in) for i, rows in rest),
+    )
+
+
+def inner_points(lin: Linearization) -> Bools:
+    """Return which points can be eliminated one by one: observed with three columns, and joined to no other point."""
+    columns = lin.unknowns["point"].columns.reshape(-1, 3)
+    seen, joined = np.zeros(len(columns), dtype=bool), np.zeros(len(columns), dtype=bool)
+    for c in lin.chunks:
+        ends = [p for p in c.parts if p.kind == "point"]
+        for p in ends:
+            (joined if len(ends) > 1 or len(p.positions) < 3 else seen)[p.nodes] = True
+    return np.asarray(seen & ~joined & (columns >= 0).any(axis=1))
+
+
+@dataclass(frozen=True)
+class _Nodes:
+    """The nodes of the reduced system: their number by kind (-1 = none), widths, and unknowns one after the other."""
+
+    number: dict[str, Ints]
+    width: Ints
+    offset: Ints
+    unknowns: Ints
+
+    @staticmethod
+    def of(lin: Linearization, inner: Bools) -> _Nodes:
+        number: dict[str, Ints] = {}
+        widths, columns, count = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)], 0
+        kept = kept_positions(lin.unknowns)
+        for group in lin.unknowns.groups:
+            sizes = np.diff(group.offsets)
+            free = np.add.reduceat(np.append(group.columns >= 0, False), group.offsets[:-1]) if len(sizes) else np.zeros(0)
+            wanted = (free > 0) & (sizes > 0)
+            if group.kind == "point":
+                wanted &= ~inner
+            number[group.kind] = np.where(wanted, count + np.cumsum(wanted) - 1, -1)
+            count += int(wanted.sum())
+            for node in np.flatnonzero(wanted):
+                own = group.columns[group.offsets[node] + kept[group.kind, int(sizes[node])]]
+                widths.append(np.array([len(own)]))
+                columns.append(own)
+        width = np.concatenate(widths)
+        return _Nodes(number, width, np.concatenate([[0], np.cumsum(width)]).astype(np.intp), np.concatenate(columns))
+
+    @property
+    def count(self) -> int:
+        return len(self.width)
+
+    def columns_of(self, node: int) -> Ints:
+        return self.unknowns[self.offset[node] : self.offset[node + 1]]
+
+    def of_chunk(self, c: Chunk) -> Ints:
+        """Return the (N, parts) node numbers of row blocks."""
+        numbers = [self.number[p.kind][p.nodes] if len(p.positions) else np.full(len(c.first), -1) for p in c.parts]
+        return np.stack(numbers, axis=1)
+
+    def places(self, members: list[Ints], centres: Floats) -> Floats | None:
+        """Return for each node the mean of the centres of its clusters; None where there are none."""
+        if not len(centres) or not np.isfinite(centres).all():
+            return None
+        at = _joined(members)
+        cluster = np.repeat(np.arange(len(members)), [len(m) for m in members])
+        count = np.bincount(at, minlength=self.count)
+        total = np.stack([np.bincount(at, centres[cluster, k], self.count) for k in range(3)], axis=1)
+        place = total / np.maximum(count, 1)[:, None]
+        place[count == 0] = centres.mean(axis=0)
+        return place
+
+
+def _joined(arrays: list[Ints]) -> Ints:
+    return np.concatenate([np.zeros(0, dtype=np.intp), *arrays])
+
+
+def _ranges(starts: Ints, lengths: Ints) -> Ints:
+    """Return starts[0], starts[0] + 1, ... of all ranges one after the other."""
+    ends = np.cumsum(lengths)
+    total = int(ends[-1]) if len(ends) else 0
+    return np.asarray(np.arange(total) + np.repeat(starts - (ends - lengths), lengths))
+
+
+def _point_part(c: Chunk, inner: Bools) -> int:
+    """Return which part of a chunk holds inner points, -1 = none."""
+    ends = [j for j, p in enumerate(c.parts) if p.kind == "point"]
+    return ends[0] if len(ends) == 1 and inner[c.parts[ends[0]].nodes].any() else -1
+
+
+def _blocks_by_point(owner: list[Ints], points: int) -> tuple[Ints, Small, Small]:
+    """Sort the row blocks by their inner point: first block of each point, chunk and row of each block."""
+    blocks = [np.flatnonzero(o >= 0) for o in owner]
+    owners = _joined([o[b] for o, b in zip(owner, blocks, strict=True)])
+    chunk = _joined([np.full(len(b), i) for i, b in enumerate(blocks)]).astype(np.int32)
+    row = _joined(blocks).astype(np.int32)
+    if np.any(np.diff(owners) < 0):
+        order = np.argsort(owners, kind="stable")
+        owners, chunk, row = owners[order], chunk[order], row[order]
+    return np.searchsorted(owners, np.arange(points + 1)).astype(np.intp), chunk, row
+
+
+def _slices(first: Ints, step: int) -> list[tuple[int, int]]:
+    """Split a list of ranges into stretches of `step` ranges."""
+    count = len(first) - 1
+    return [(a, min(a + step, count)) for a in range(0, count, step)]
+
+
+def _clusters(first_block: Ints, chunk: Small, row: Small, seen: list[Ints], nodes: _Nodes) -> tuple[Ints, list[Ints], Bools]:
+    """Gather neighbouring points that see nearly the same nodes: first point of each cluster, its nodes, whether it is sparse."""
+    count = len(first_block) - 1
+    cuts = np.append(np.arange(0, count, BASE), count) if count else np.zeros(1, dtype=np.intp)
+    sets: list[Ints] = []
+    for a, b in _slices(cuts, 256):
+        mark = np.zeros((b - a, nodes.count), dtype=bool)
+        for i, at, base in _stretch(first_block[cuts], a, b, chunk):
+            for j in range(seen[i].shape[1]):
+                number = seen[i][row[at], j]
+                mark[base[number >= 0], number[number >= 0]] = True
+        sets += [np.flatnonzero(m) for m in mark]
+    touched = _touched(first_block, chunk, row, seen, nodes)
+    first, members, sparse = [0], [], []
+    k = 0
+    while k < len(sets):
+        union, end = sets[k], k + 1
+        width = widest = int(nodes.width[union].sum())
+        while end < len(sets) and cuts[end + 1] - cuts[k] <= MOST:
+            more = np.union1d(union, sets[end])
+            size = int(nodes.width[more].sum())
+            widest = max(widest, int(nodes.width[sets[end]].sum()))
+            if size > GROWTH * widest or size * (cuts[end + 1] - cuts[k]) > LARGEST:
+                break
+            union, width, end = more, size, end + 1
+        members.append(union)
+        first.append(int(cuts[end]))
+        sparse.append(width > SPARSE * float(np.sqrt(np.mean(touched[cuts[k] : cuts[end]] ** 2.0))))
+        k = end
+    return np.array(first, dtype=np.intp), members, np.array(sparse, dtype=bool)
+
+
+def _touched(first_block: Ints, chunk: Small, row: Small, seen: list[Ints], nodes: _Nodes) -> Ints:
+    """Return an upper bound of the columns that each point touches: shared nodes counted once if they come last."""
+    width = np.append(nodes.width, 0)
+    per_block = np.zeros(len(chunk), dtype=np.intp)
+    for i, numbers in enumerate(seen):
+        at = np.flatnonzero(chunk == i)
+        per_block[at] = width[numbers[row[at]]].sum(axis=1)
+    total = np.concatenate([[0], np.cumsum(per_block)])
+    return np.asarray(total[first_block[1:]] - total[first_block[:-1]])
+
+
+def _stretch(first: Ints, a: int, b: int, chunk: Small) -> list[tuple[int, Ints, Ints]]:
+    """Return for each chunk the blocks of ranges a ... b, and the range (from a) of each."""
+    blocks = np.arange(first[a], first[b])
+    base = np.repeat(np.arange(b - a), np.diff(first[a : b + 1]))
+    own = chunk[first[a] : first[b]]
+    kinds = np.unique(own)
+    if len(kinds) == 1:
+        return [(int(kinds[0]), blocks, base)]
+    return [(int(i), blocks[own == i], base[own == i]) for i in kinds]
+
+
+def _distinct(sets: Ints) -> list[Ints]:
+    """Return the different sets of nodes in the rows of an array; -1 = none."""
+    rows = np.unique(np.sort(sets, axis=1), axis=0)
+    return [np.unique(m[m >= 0]) for m in rows if (m >= 0).any()]
+
+
+def _centres(coordinates: Floats, first_point: Ints) -> Floats:
+    """Return the mean of the points of each cluster."""
+    if len(first_point) < 2:
+        return np.zeros((0, 3))
+    return np.asarray(np.add.reduceat(coordinates, first_point[:-1], axis=0) / np.diff(first_point)[:, None])
+
+
+def _graph(cliques: list[Ints], count: int) -> Any:
+    """Return the graph whose edges join all nodes of each clique."""
+    lengths = [len(m) for m in cliques]
+    at = (np.repeat(np.arange(len(cliques)), lengths), _joined(cliques))
+    incidence = coo_array((np.ones(sum(lengths), dtype=np.int32), at), shape=(len(cliques), count)).tocsr()
+    return (incidence.T @ incidence).tocsr()
+
+
+def _nodes_of_fronts(parts: list[Ints], cliques: list[Ints], position: Ints, front_of: Ints) -> list[Ints]:
+    """Return the nodes of each front in the order of elimination: those eliminated in it, then its boundary."""
+    found: list[list[Ints]] = [[p] for p in parts]
+    for m in cliques:
+        if len(m):
+            found[front_of[m[np.argmin(position[m])]]].append(m)
+    out = []
+    for f, own in enumerate(parts):
+        nodes = np.unique(np.concatenate(found[f]))
+        found[f] = []
+        nodes = nodes[np.argsort(position[nodes])]
+        boundary = nodes[len(own) :]
+        if len(boundary):
+            found[front_of[boundary[0]]].append(boundary)
+        out.append(nodes)
+    return out
+
+
+class _RowsInFronts:
+    """Where the columns of a node begin in a front."""
+
+    def __init__(self, front_nodes: list[Ints], nodes: _Nodes) -> None:
+        self.count = nodes.count
+        width = [nodes.width[n] for n in front_nodes]
+        keys = _joined([f * self.count + n for f, n in enumerate(front_nodes)])
+        begin = _joined([np.cumsum(w) - w for w in width])
+        order = np.argsort(keys)
+        self.keys, self.begin = keys[order], begin[order]
+
+    def __call__(self, front: Any, nodes: Ints) -> Ints:
+        return np.asarray(self.begin[np.searchsorted(self.keys, front * self.count + nodes)]) if len(nodes) else nodes
+
+
+def _fronts(parts: list[Ints], front_nodes: list[Ints], home: Ints, nodes: _Nodes, begin: Ints, front_of: Ints) -> tuple[Front, ...]:
+    rows_in = _RowsInFronts(front_nodes, nodes)
+    order = np.argsort(home, kind="stable")
+    first = np.searchsorted(home[order], np.arange(len(parts) + 1))
+    boundary = [n[len(p) :] for n, p in zip(front_nodes, parts, strict=True)]
+    parent = [int(front_of[b[0]]) if len(b) else -1 for b in boundary]
+    children: list[list[int]] = [[] for _ in parts]
+    for f, q in enumerate(parent):
+        if q >= 0:
+            children[q].append(f)
+    out = []
+    for f, own in enumerate(parts):
+        width = nodes.width[boundary[f]]
+        out.append(
+            Front(
+                begin=int(begin[own[0]]),
+                pivots=int(nodes.width[own].sum()),
+                columns=_ranges(begin[front_nodes[f]], nodes.width[front_nodes[f]]),
+                parent=parent[f],
+                into_parent=_ranges(rows_in(parent[f], boundary[f]), width) if parent[f] >= 0 else np.zeros(0, dtype=np.intp),
+                children=tuple(children[f]),
+                clusters=order[first[f] : first[f + 1]],
+            )
+        )
+    return tuple(out)
+
+
+def _starts(
+    seen: list[Ints], part: tuple[int, ...], chunk: Small, row: Small, first: Ints, members: list[Ints], widths: list[Ints], count: int
+) -> list[Small]:
+    """Return for each chunk where the columns of each part begin in the cluster of the block."""
+    out = [np.full(numbers.shape, -1, dtype=np.int32) for numbers in seen]
+    for a, b in _slices(first, 256):
+        table = np.full((b - a, count + 1), -1, dtype=np.int32)
+        for k in range(a, b):
+            table[k - a, members[k]] = np.cumsum(widths[k]) - widths[k]
+        for i, at, base in _stretch(first, a, b, chunk):
+            rows = row[at]
+            out[i][rows] = table[base[:, None], seen[i][rows]]
+    return out
+
+
+def _rest(i: int, rows: Ints, sets: Ints, c: Chunk, position: Ints, front_of: Ints, rows_in: _RowsInFronts) -> Rest:
+    late = np.append(position, len(position))[sets]
+    earliest = np.argmin(late, axis=1)
+    first = sets[np.arange(len(sets)), earliest]
+    front = np.append(front_of, -1)[first]
+    at = []
+    for j, p in enumerate(c.parts):
+        width = len(p.positions)
+        columns = np.full((len(rows), width), -1)
+        there = np.flatnonzero(sets[:, j] >= 0)
+        columns[there] = rows_in(front[there], sets[there, j])[:, None] + np.arange(width)
+        at.append(columns)
+    return Rest(i, rows, front, np.concatenate(at, axis=1))

@@ -1,0 +1,195 @@
+"""Tables of a project for observation kinds whose rows are points, nodes of declared unknowns, a value and a sigma; and those unknowns.
+
+Who adds such a kind adds one line to `KIND_TABLES`; who declares unknowns adds their class to `DECLARED`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from baarda.cameras import FIXED, FREE, STATES
+from baarda.errors import InputError, UsageError
+from baarda.formats.base import label_problem
+from baarda.formats.checks import sigma_range
+from baarda.formats.csv_table import CsvTable, numbers_text, quoted
+from baarda.network import Declared, Network, Points
+from baarda.observations import Angles, Directions, HeightDifferences, Stations
+
+Floats = NDArray[np.float64]
+Columns = dict[str, list[str]]
+
+
+@dataclass(frozen=True)
+class KindTable:
+    """How the rows of a kind are written.
+
+    Attributes
+    ----------
+    kind : str
+        Name of the table, and of the kind in `project.toml`.
+    group : type
+        Class of the observation group.
+    points : mapping
+        Column to attribute, of indices of object points; they differ within a row.
+    nodes : mapping
+        Column to attribute and unknown group, of nodes of declared unknowns.
+    in_units : bool
+        Whether values are in object units; else they are in radians.
+    """
+
+    kind: str
+    group: type[Any]
+    points: Mapping[str, str]
+    nodes: Mapping[str, tuple[str, str]]
+    in_units: bool
+
+    @property
+    def name(self) -> str:
+        """Name of a group of which none is given."""
+        return self.kind.replace("_", " ")
+
+    @property
+    def columns(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Required and optional columns."""
+        return (*self.nodes, *self.points, "value"), ("group", "sigma")
+
+    def write(self, group: Any, network: Network) -> Columns:
+        """Return the columns of a group."""
+        labels = [quoted(t) for t in network.points.labels]
+        out = {"group": [quoted(group.name)] * len(group)}
+        for column, (attribute, kind) in self.nodes.items():
+            nodes = next(d for d in network.declared if d.kind == kind).labels
+            out[column] = [quoted(nodes[i]) for i in getattr(group, attribute).tolist()]
+        for column, attribute in self.points.items():
+            out[column] = [labels[i] for i in getattr(group, attribute).tolist()]
+        return {**out, "value": numbers_text(group.values), "sigma": numbers_text(group.sigmas)}
+
+    def read(self, table: CsvTable | None, usual: Floats, points: Points, unit: str, declared: tuple[Declared, ...]) -> Any:
+        """Return all rows of a table as one group, checked; an empty one without a table.
+
+        Raises
+        ------
+        InputError
+            With file and line.
+        """
+        more = {"unit": unit} if self.in_units else {}
+        names = (*(a for a, _ in self.nodes.values()), *self.points.values())
+        if table is None:
+            nothing = np.zeros(0, dtype=np.intp)
+            return self.group(**dict.fromkeys(names, nothing), values=np.zeros(0), sigmas=np.zeros(0), **more)
+        codes = {}
+        for column, (attribute, kind) in self.nodes.items():
+            nodes = next((d.labels for d in declared if d.kind == kind), ())
+            codes[attribute] = table.codes(column, {t: i for i, t in enumerate(nodes)}, kind)
+        index = {t: i for i, t in enumerate(points.labels)}
+        ends = [table.codes(column, index, "point") for column in self.points]
+        sorted_ends = np.sort(np.stack(ends, axis=1), axis=1)
+        _refuse(table, (np.diff(sorted_ends, axis=1) == 0).any(axis=1), f"the points of {self.name} must be different")
+        values, sigma = table.numbers("value", None), table.sigmas("sigma")
+        sigma = np.where(np.isnan(sigma), usual, sigma)
+        _refuse(table, ~(sigma > 0.0), "sigma must be there and positive")
+        sigma_range(sigma, "sigma", table.error)
+        return self.group(**codes, **dict(zip(self.points.values(), ends, strict=True)), values=values, sigmas=sigma, **more)
+
+
+KIND_TABLES = {
+    t.kind: t
+    for t in (
+        KindTable("directions", Directions, {"from": "starts", "to": "ends"}, {"station": ("sets", "station")}, in_units=False),
+        KindTable("angles", Angles, {"from": "starts", "back": "backs", "fore": "fores"}, {}, in_units=False),
+        KindTable("height_differences", HeightDifferences, {"from": "starts", "to": "ends"}, {}, in_units=True),
+    )
+}
+DECLARED: dict[str, type[Declared]] = {"station": Stations}
+DECLARED_COLUMNS = (("kind", "node", "parameter", "value"), ("unit", "state"))
+
+
+def kind_table_of(group: Any) -> KindTable:
+    """Return the table of an observation group.
+
+    Raises
+    ------
+    UsageError
+        If there is none for its kind.
+    """
+    found = next((t for t in KIND_TABLES.values() if type(group) is t.group), None)
+    if found is None:
+        raise UsageError(f"observations of the kind {type(group).__name__} cannot be written to a project")
+    return found
+
+
+def declared_columns(declared: tuple[Declared, ...]) -> Columns:
+    """Return the columns of the table of declared unknowns.
+
+    Raises
+    ------
+    UsageError
+        If a label cannot be written, or a kind could not be read back.
+    """
+    out: Columns = {name: [] for name in ("kind", "node", "parameter", "value", "unit", "state")}
+    for d in declared:
+        if d.kind not in DECLARED:
+            raise UsageError(f"unknowns of the kind {d.kind!r} cannot be written to a project")
+        if len(set(d.labels)) < len(d.labels):
+            raise UsageError(f"two unknowns of the kind {d.kind!r} have the same label")
+        for node, label in enumerate(d.labels):
+            problem = label_problem(label, d.kind)
+            if problem or not label:
+                raise UsageError(f"{problem or f'a {d.kind} has an empty label'}: it cannot be written")
+            for k, name in enumerate(d.parameters[node if len(d.parameters) > 1 else 0]):
+                row = (quoted(d.kind), quoted(label), quoted(name), None, quoted(d.unit_of(node, k)), STATES[d.states[d.offsets[node] + k]])
+                for column, text in zip(out, row, strict=True):
+                    if text is not None:
+                        out[column].append(text)
+        out["value"] += numbers_text(d.values)
+    return out
+
+
+def read_declared(table: CsvTable) -> tuple[Declared, ...]:
+    """Return the declared unknowns of a table; rows of one node follow each other.
+
+    Raises
+    ------
+    InputError
+        With file and line.
+    """
+    kinds, nodes, names = (table.texts(c) for c in ("kind", "node", "parameter"))
+    units, said = table.texts("unit", ""), table.choices("state", STATES)
+    values = table.numbers("value", None)
+    for row, text in enumerate(kinds):
+        if text not in DECLARED:
+            raise table.error(row, f"unknowns of the kind {text!r} are not known; known are {', '.join(DECLARED)}")
+    states = np.where(said < 0, FREE, said)
+    _refuse(table, ~np.isin(states, (FIXED, FREE)), "a declared unknown must be fixed or free")
+    out = []
+    for kind in dict.fromkeys(kinds):
+        rows = [r for r, text in enumerate(kinds) if text == kind]
+        groups: dict[str, list[int]] = {}
+        last = None
+        for r in rows:
+            if nodes[r] in groups and nodes[r] != last:
+                raise table.error(r, f"the rows of {kind} {nodes[r]!r} do not follow each other")
+            last = nodes[r]
+            if names[r] in [names[i] for i in groups.setdefault(nodes[r], [])]:
+                raise table.error(r, f"{names[r]} of {kind} {nodes[r]!r} appears twice")
+            groups[nodes[r]].append(r)
+        parameters = tuple(tuple(names[i] for i in g) for g in groups.values())
+        unit = tuple(tuple(units[i] for i in g) for g in groups.values())
+        if len(set(parameters)) == 1 and len(set(unit)) == 1:
+            parameters, unit = parameters[:1], unit[:1]
+        try:
+            out.append(DECLARED[kind](kind, tuple(groups), parameters, unit, values[rows], states[rows].astype(np.int8)))
+        except UsageError as error:
+            raise InputError(str(error), table.file) from None
+    return tuple(out)
+
+
+def _refuse(table: CsvTable, bad: NDArray[np.bool_], message: str) -> None:
+    rows = np.flatnonzero(bad)
+    if len(rows):
+        raise table.error(int(rows[0]), message)

@@ -1,0 +1,66 @@
+"""Geographic coordinates of an ellipsoid, geocentric ones, and the frame (east, north, up) that touches the ellipsoid at a point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+#: semi-major axis in metres and flattening of WGS 84
+A, F = 6378137.0, 1.0 / 298.257223563
+_E2 = F * (2.0 - F)
+
+
+def geocentric(lla: Floats) -> Floats:
+    """Return geocentric X, Y, Z of latitude, longitude (degrees) and ellipsoidal height (metres), (..., 3) to (..., 3).
+
+    Notes
+    -----
+    Hofmann-Wellenhof et al., GNSS (2008), eq. 8.6.
+
+    Examples
+    --------
+    >>> geocentric(np.array([0.0, 90.0, 10.0])).round(6) + 0.0
+    array([      0., 6378147.,       0.])
+    """
+    lla = np.asarray(lla, dtype=float)
+    lat, lon, h = np.radians(lla[..., 0]), np.radians(lla[..., 1]), lla[..., 2]
+    n = A / np.sqrt(1.0 - _E2 * np.sin(lat) ** 2)
+    return np.stack(
+        [(n + h) * np.cos(lat) * np.cos(lon), (n + h) * np.cos(lat) * np.sin(lon), (n * (1.0 - _E2) + h) * np.sin(lat)], axis=-1
+    )
+
+
+@dataclass(frozen=True)
+class TangentFrame:
+    """East, north and up from a point of latitude, longitude (degrees) and ellipsoidal height (metres).
+
+    Examples
+    --------
+    >>> frame = TangentFrame(52.0, 13.0, 40.0)
+    >>> frame.local(np.array([[52.0, 13.0, 41.5]])).round(6) + 0.0
+    array([[0. , 0. , 1.5]])
+    """
+
+    latitude: float
+    longitude: float
+    height: float
+
+    @property
+    def rotation(self) -> Floats:
+        """The matrix from geocentric differences to east, north, up."""
+        lat, lon = np.radians(self.latitude), np.radians(self.longitude)
+        sf, cf, sl, cl = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
+        return np.array([[-sl, cl, 0.0], [-sf * cl, -sf * sl, cf], [cf * cl, cf * sl, sf]])
+
+    @property
+    def origin(self) -> Floats:
+        """Geocentric coordinates of the point."""
+        return geocentric(np.array([self.latitude, self.longitude, self.height]))
+
+    def local(self, lla: Floats) -> Floats:
+        """Return east, north, up of latitude, longitude (degrees) and ellipsoidal height, (n, 3) to (n, 3)."""
+        return np.asarray((geocentric(lla) - self.origin) @ self.rotation.T)

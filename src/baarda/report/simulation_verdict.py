@@ -1,0 +1,218 @@
+"""The figures of a planned network and the sentences that tell them, with what replicas prove."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from baarda.network import AXES
+from baarda.observations import ImagePoints
+from baarda.procedures.planning import Planned
+from baarda.procedures.proof import Proof
+from baarda.report.sections._numbers import column, finer, fixed, names, plural, significant
+from baarda.report.sections.base import Sentence, say
+
+_WEAK = 0.1
+
+
+def prediction(planned: Planned) -> dict[str, Any]:
+    """Return the figures of precision and reliability of a prediction.
+
+    Parameters
+    ----------
+    planned : Planned
+
+    Returns
+    -------
+    dict
+        Point sigmas (object units), image sigmas, redundancy numbers, minimal detectable biases of image points (pixels and multiples of
+        their sigma), external reliability, correlations.
+    """
+    a = planned.adjustment
+    points = a.point_table("apriori")
+    sigmas = np.stack([points[f"s{axis}"] for axis in AXES], axis=1)
+    free = np.asarray((sigmas > 0.0).any(axis=1))
+    spatial = np.sqrt((sigmas**2).sum(axis=1))
+    images = a.image_table("apriori")
+    share, r = a.controlled_share, a.redundancy_numbers
+    table = planned.observations
+    image_rows = np.concatenate([np.full(len(g) * len(g.components), isinstance(g, ImagePoints)) for g in a.groups])
+    seen = image_rows & planned.controlled
+    bias = table["mdb"]
+    out: dict[str, Any] = {
+        "points": {
+            "count": int(free.sum()),
+            "median": {axis: median(sigmas[free, k]) for k, axis in enumerate(AXES)},
+            "largest": {axis: largest(sigmas[free, k]) for k, axis in enumerate(AXES)},
+            "weakest": [str(points["point"][i]) for i in np.argsort(-spatial, kind="stable")[:5] if free[i]],
+        },
+        "images": {f"median_s{name}": median(images[f"s{name}"]) for name in ("X0", "Y0", "Z0", "omega_rad", "phi_rad", "kappa_rad")},
+        "redundancy": {
+            "mean": float(r.mean()),
+            "median": median(r),
+            "least": float(share.min()),
+            "weak": int(((share < _WEAK) & planned.controlled).sum()),
+            "uncontrolled": int((~planned.controlled).sum()),
+        },
+        "mdb_image_points": {
+            "median_px": median(bias[seen]),
+            "largest_px": largest(bias[seen]),
+            "median_in_sigma": median((bias / a.sigmas)[seen]),
+        },
+        "external_reliability": {"median": median(table["external"][planned.controlled]), "largest": largest(table["external"])},
+        "correlations": [{"a": x, "b": y, "value": v} for x, y, v in a.camera_correlations()],
+    }
+    return out
+
+
+def median(x: Any) -> float | None:
+    """Return the median of the finite values, None where there are none."""
+    x = np.asarray(x, dtype=float)
+    x = x[np.isfinite(x)]
+    return float(np.median(x)) if len(x) else None
+
+
+def largest(x: Any) -> float | None:
+    """Return the largest finite value, None where there is none."""
+    x = np.asarray(x, dtype=float)
+    x = x[np.isfinite(x)]
+    return float(x.max()) if len(x) else None
+
+
+def sentences(planned: Planned, proof: Proof | None) -> list[Sentence]:
+    """Return the verdict."""
+    a, figures, o = planned.adjustment, prediction(planned), planned.options
+    out = [
+        Sentence(
+            "network",
+            say(
+                "{n} observations, {u} unknowns, redundancy {r}; true geometry: {reason}. {datum}",
+                n=a.count,
+                u=a.numbering.count,
+                r=a.redundancy,
+                reason=planned.reason,
+                datum=a.datum.text,
+            ),
+            "info",
+        )
+    ]
+    p = figures["points"]
+    if p["count"]:
+        unit, factor = finer(a.network.unit, [v for v in p["median"].values() if v is not None])
+        told = column([(v or 0.0) * factor for d in (p["median"], p["largest"]) for v in d.values()], 2)
+        out.append(
+            Sentence(
+                "precision",
+                say(
+                    "Predicted standard deviations of {count} points, median X {x}, Y {y}, Z {z} {unit}; largest {lx}, {ly}, {lz} {unit}; "
+                    "weakest: {weak}.",
+                    count=p["count"],
+                    x=told[0],
+                    y=told[1],
+                    z=told[2],
+                    lx=told[3],
+                    ly=told[4],
+                    lz=told[5],
+                    unit=unit,
+                    weak=names(p["weakest"]),
+                ),
+                "info",
+                "points",
+            )
+        )
+    r, m = figures["redundancy"], figures["mdb_image_points"]
+    if m["median_px"] is not None:
+        text = say(
+            "Redundancy numbers average {mean}; a bias of {px} px ({times} sigma; median) in an image coordinate is found with power "
+            "{power} at level {level}, the largest such bias is {most} px.",
+            mean=fixed(r["mean"], 3),
+            px=significant(m["median_px"]),
+            times=significant(m["median_in_sigma"]),
+            power=f"{o.power:g}",
+            level=f"{o.alpha_outlier:g}",
+            most=significant(m["largest_px"]),
+        )
+        out.append(Sentence("reliability", text, "warn" if r["uncontrolled"] else "info", "reliability"))
+    if r["uncontrolled"]:
+        text = say("{rows} not controlled by any other: errors in them stay hidden.", rows=_are(r["uncontrolled"], "observation"))
+        out.append(Sentence("uncontrolled", text, "warn", "reliability"))
+    high = figures["correlations"]
+    if high:
+        c = high[0]
+        text = say(
+            "{n} with |correlation| of at least 0.95, first {a} with {b} ({v}).", n=plural(len(high), "pair"), **c, v=fixed(c["value"], 4)
+        )
+        out.append(Sentence("correlations", text, "warn", "cameras"))
+    return out + (_proof_sentences(proof) if proof is not None else [])
+
+
+def _are(count: int, word: str) -> str:
+    return f"{plural(count, word)} {'is' if count == 1 else 'are'}"
+
+
+def _proof_sentences(p: Proof) -> list[Sentence]:
+    out = []
+    asked, count = p.replicas.asked, p.replicas.count
+    if count < asked:
+        text = say("{lost} of {asked} replicas have no result: {first}", lost=asked - count, asked=asked, first=p.replicas.batch.failed[0])
+        out.append(Sentence("replicas", text, "warn", "proof"))
+    s = p.sigmas
+    wrong = [x.name for x in s if not x.holds]
+    low, high = min(s, key=lambda x: x.ratio), max(s, key=lambda x: x.ratio)
+    text = say(
+        "{count} replicas: sampled / predicted standard deviations lie between {low} ({a}) and {high} ({b}); {decision}.",
+        count=count,
+        low=fixed(low.ratio, 3),
+        a=low.name,
+        high=fixed(high.ratio, 3),
+        b=high.name,
+        decision=say("beyond chance for {names}", names=names(wrong)) if wrong else "chance explains the differences",
+    )
+    out.append(Sentence("sigmas", text, "bad" if wrong else "good", "proof"))
+    if any(getattr(g, "residual_plane", "image") == "corrected" for g in p.replicas.planned.adjustment.groups):
+        text = (
+            "The errors drawn are those of measured image coordinates; this network takes its residuals in the corrected plane, where the "
+            "distortion stretches them. --residual-plane image avoids it."
+        )
+        out.append(Sentence("residual plane", text, "warn", "proof"))
+    sure = 1e-4
+    if p.worst[2] < sure:
+        text = say("The errors of {name} scatter {ratio} times as predicted: beyond chance.", name=p.worst[0], ratio=fixed(p.worst[1], 3))
+        out.append(Sentence("single sigmas", text, "bad", "proof"))
+    if p.bias[2] < sure:
+        text = say(
+            "The mean error of {name} is {mean} of its standard deviation: beyond chance, the network is noticeably not linear.",
+            name=p.bias[0],
+            mean=fixed(p.bias[1], 3),
+        )
+        out.append(Sentence("bias", text, "warn", "proof"))
+    text = say(
+        "v'Pv averages {mean}, expected is r = {r} (95 % of such means lie within {half} of it).",
+        mean=fixed(p.objective.rate, 1),
+        r=fixed(p.objective.expected, 0),
+        half=fixed(1.96 * float(np.sqrt(2.0 * p.objective.expected / count)), 1),
+    )
+    out.append(Sentence("global", text, "good" if p.objective.holds else "bad", "proof"))
+    told = [x for x in p.sizes if x.told]
+    wrong = [f"{x.name} ({100 * x.rate:.3g} % instead of {100 * x.expected:.3g} %)" for x in told if not x.holds]
+    words = say("{wrong} of them not: {names}", wrong=len(wrong), names=names(wrong)) if wrong else "none deviates beyond chance"
+    text = say("{count} tests of true hypotheses reject as often as their level says; {words}.", count=len(told) - len(wrong), words=words)
+    if told:
+        out.append(Sentence("sizes", text, "bad" if wrong else "good", "proof"))
+    few = [x.name for x in p.sizes if not x.told]
+    if few:
+        text = say("Too few replicas to tell the size of {names}.", names=names(few, 4))
+        out.append(Sentence("replicas", text, "info", "proof"))
+    if p.power is not None:
+        text = say(
+            "Biases of the minimal detectable size are found by w in {rate} % of the replicas ({low} to {high} %), promised are {power} %; "
+            "in {right} % the observation at fault has the largest |w|.",
+            rate=fixed(100 * p.power.rate, 1),
+            low=fixed(100 * p.power.low, 1),
+            high=fixed(100 * p.power.high, 1),
+            power=fixed(100 * p.power.expected, 1),
+            right=fixed(100 * p.identified, 1),
+        )
+        out.append(Sentence("power", text, "good" if p.power.holds else "bad", "proof"))
+    return out
