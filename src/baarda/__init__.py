@@ -12,7 +12,9 @@ __version__ = "0.1.0"
 
 _PUBLIC = {
     "read": "baarda.formats",
-    "write_project": "baarda.formats.project",
+    "write_project": "baarda.formats.project:write",
+    "write_covariance": "baarda.formats.covariance_file",
+    "write_points": "baarda.formats.geojson",
     "adjust": "baarda.adjustment",
     "Adjustment": "baarda.adjustment",
     "Network": "baarda.network",
@@ -30,7 +32,8 @@ __all__ = sorted([*_PUBLIC, *_MODULES, "__version__"])
 
 def __getattr__(name: str) -> Any:
     if name in _PUBLIC:
-        return getattr(import_module(_PUBLIC[name]), name)
+        module, _, member = _PUBLIC[name].partition(":")
+        return getattr(import_module(module), member or name)
     if name in _MODULES:
         return import_module(f"baarda.{name}")
     raise AttributeError(f"module 'baarda' has no attribute {name!r}")

@@ -60,7 +60,7 @@ def similarity_directions(unknowns: Unknowns, state: State) -> Floats:
 
     known = state.points[np.isfinite(state.points).all(axis=1)]
     everything = np.concatenate([known, state.position])
-    size = float(np.sqrt((everything**2).sum(axis=1).mean())) or 1.0
+    size = (float(np.sqrt((everything**2).sum(axis=1).mean())) if len(everything) else 0.0) or 1.0
     turn = np.zeros((len(state.position), 3, 7))
     turn[:, :, 3:6] = -state.rotation / size
     parts = {

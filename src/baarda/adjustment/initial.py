@@ -51,6 +51,9 @@ def complete(network: Network, aside: Bools) -> tuple[Network, list[str]]:
     UsageError
         If there are no image points to find them with.
     """
+    for group in network.observations:
+        if hasattr(group, "with_start"):  # kinds that know how to start the unknowns that they declare
+            network = group.with_start(network, aside)
     images, points = network.images, network.points
     missing_images = np.asarray(~(np.isfinite(images.position).all(axis=1) & np.isfinite(images.rotation).all(axis=(1, 2))))
     missing_points = np.asarray(~np.isfinite(points.coordinates).all(axis=1) & ~aside)

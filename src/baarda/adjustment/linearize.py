@@ -182,18 +182,17 @@ class Linearization:
 
     def times(self, x: Floats, kinds: Container[str] | None = None) -> Floats:
         """Return A x for (u,) or (u, k) vectors; with `kinds` only of the parts of these unknown groups."""
-        if x.ndim == 2:
-            if self.count <= FEW and kinds is None:
-                return np.asarray(self.design @ x)
-            return np.stack([self.times(column, kinds) for column in x.T], axis=1) if x.shape[1] else np.zeros((self.count, 0))
-        padded = np.append(x, 0.0)
-        out = np.zeros(self.count)
+        if x.ndim == 2 and self.count <= FEW and kinds is None:
+            return np.asarray(self.design @ x)
+        padded = np.concatenate([x, np.zeros((1, *x.shape[1:]))])
+        out = np.zeros((self.count, *x.shape[1:]))
         loops = vector_loops(self.count)
+        multiply = loops.times if x.ndim == 1 else loops.times_many
 
         def product(c: Chunk, some: slice) -> None:
             for part in c.parts:
                 if kinds is None or part.kind in kinds:
-                    loops.times(part.jacobian[some], part.nodes[some], part.table, padded, c.first[some], out)
+                    multiply(part.jacobian[some], part.nodes[some], part.table, padded, c.first[some], out)
 
         self._each(product)
         return out
@@ -213,10 +212,8 @@ class Linearization:
 
     def transposed(self, y: Floats, kinds: Container[str] | None = None) -> Floats:
         """Return A' y for (n,) or (n, k) vectors; with `kinds` only the rows of these unknown groups, the others zero."""
-        if y.ndim == 2:
-            if self.count <= FEW and kinds is None:
-                return np.asarray(self.design.T @ y)
-            return np.stack([self.transposed(v, kinds) for v in y.T], axis=1) if y.shape[1] else np.zeros((self.unknowns.count, 0))
+        if y.ndim == 2 and self.count <= FEW and kinds is None:
+            return np.asarray(self.design.T @ y)
         return self._gathered(y, kinds, squared=False)
 
     def column_sums(self, weights: Floats) -> Floats:
@@ -227,14 +224,18 @@ class Linearization:
         """Add up what the row blocks contribute to their columns, part by part."""
         loops = vector_loops(self.count)
         parts = [(c, p) for c in self.chunks for p in c.parts if kinds is None or p.kind in kinds]
+        y = np.ascontiguousarray(y)
 
         def contribute(i: int) -> Floats:
             c, part = parts[i]
-            own = np.zeros(self.unknowns.count + 1)
-            loops.gathered(part.jacobian, part.nodes, part.table, np.ascontiguousarray(y), c.first, squared, own)
+            own = np.zeros((self.unknowns.count + 1, *y.shape[1:]))
+            if y.ndim == 1:
+                loops.gathered(part.jacobian, part.nodes, part.table, y, c.first, squared, own)
+            else:
+                loops.gathered_many(part.jacobian, part.nodes, part.table, y, c.first, own)
             return own
 
-        out = np.zeros(self.unknowns.count + 1)
+        out = np.zeros((self.unknowns.count + 1, *y.shape[1:]))
         for own in for_each(range(len(parts)), contribute, self.workers):
             out += own
         return out[:-1]

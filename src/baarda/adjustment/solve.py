@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
@@ -316,16 +316,18 @@ def _iterate(
 ) -> tuple[State, Linearization, list[Iteration], bool]:
     """Gauss-Newton with Levenberg's damping where a full step does not help.
 
-    The damping follows Nielsen's rule (1999); each step is bent by the second derivative along it, solved with the same factor
-    (geodesic acceleration: Transtrum & Sethna 2012), so that narrow curved valleys of weak self-calibrations are followed, not crept along.
+    The damping follows Nielsen's rule (1999). Steps that shrink at a constant rate, as large residuals make them, are extrapolated
+    (Aitken); others are bent by the second derivative along them, solved with the same factor (geodesic acceleration: Transtrum &
+    Sethna 2012), so that narrow curved valleys of weak self-calibrations are followed, not crept along.
     """
     objective = float(lin.misclosure @ lin.misclosure)
     floor = lin.count * 1e-8  # residuals of 1e-4 sigma count as none
     history = [Iteration(0, objective, None, 0.0, True)]
     damping, growth, last, curved = 0.0, 2.0, np.inf, False
+    before: Floats | None = None  # the last full step, as a change of the observations
 
     def misclosures(step: Floats) -> tuple[State, Floats, float]:
-        trial = state.moved(lin.unknowns, step)
+        trial = state.moved(lin.unknowns, step, centres_of_rays(groups.groups, state))
         values = whitened_misclosures(network, trial, groups)
         return trial, values, float(values @ values) if np.isfinite(values).all() else np.inf
 
@@ -339,7 +341,11 @@ def _iterate(
         change = lin.times(step)
         predicted = 2.0 * float(step @ rhs) - float(change @ change)
         relative = float(np.linalg.norm(change) / np.sqrt(max(objective, floor)))
-        if relative > max(BEND, 0.1 * last if np.isfinite(last) else 0.0):  # steps that shrink fast need no bending
+        lengthened = 1.0
+        if damping == 0.0 and before is not None and relative < 0.01:
+            lengthened = _extrapolated(change, before)
+            step, predicted = lengthened * step, 2.0 * lengthened * float(step @ rhs) - lengthened**2 * float(change @ change)
+        if lengthened == 1.0 and relative > max(BEND, 0.1 * last if np.isfinite(last) else 0.0):  # steps that shrink fast need no bending
             step = _bent(lin, solver, datum, step, change, lambda x: misclosures(x)[1])
         trial, _, value = misclosures(step)
         gain = (objective - value) / predicted if predicted > 0.0 else 0.0
@@ -349,10 +355,12 @@ def _iterate(
         if settings.progress is not None:
             settings.progress(history[-1])
         if not accepted:
+            before = None
             curved |= relative < 1e-3  # large residuals bend the problem so much that full steps fail even beside the solution
             damping, growth, last = max(damping * growth, 1e-4 if relative > 0.1 else 1e-7), 2.0 * growth, np.inf
             continue
         state, objective = trial, value
+        before = change if damping == 0.0 and lengthened == 1.0 else None
         lin = linearize(network, state, lin.unknowns, groups)
         settled = relative <= settings.tolerance or (relative <= 1e-7 and relative >= 0.5 * last)
         if settled and (damping == 0.0 or _full_step(lin, tied, factor) <= 1e-6):
@@ -362,6 +370,26 @@ def _iterate(
             damping = 0.0
         growth, last = 2.0, relative
     return state, lin, history, False
+
+
+def _extrapolated(change: Floats, before: Floats) -> float:
+    """Return by how much to lengthen a step that repeats the last one at a constant rate (Aitken's extrapolation), else 1."""
+    product, square = float(change @ before), float(before @ before)
+    rate = product / square
+    alike = product**2 > 0.8 * square * float(change @ change)
+    return 1.0 / (1.0 - rate) if alike and 0.1 < abs(rate) < 0.8 else 1.0
+
+
+def centres_of_rays(groups: Sequence[Kind], state: State) -> Floats:
+    """Return for each point the mean place of the images that see it, NaN where none does."""
+    total, count = np.zeros((len(state.points), 3)), np.zeros(len(state.points))
+    for group in groups:
+        if isinstance(group, ImagePoints):
+            count += np.bincount(group.points, minlength=len(count))
+            for k in range(3):
+                total[:, k] += np.bincount(group.points, state.position[group.images, k], len(count))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(total / count[:, None])
 
 
 def _full_step(lin: Linearization, datum: Datum, factor: Callable[..., Solver]) -> float:

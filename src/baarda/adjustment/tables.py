@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from baarda.cameras import FREE, STATES
+from baarda.cameras import STATES
 from baarda.geometry import rotation as rot
 from baarda.network import AXES, ROLES, Network, Table
 from baarda.observations import ImagePoints
@@ -71,7 +71,8 @@ def unknown_table(a: Adjustment, sigma: Scaling) -> Table:
                 for k in np.flatnonzero(at[i] >= 0).tolist():
                     full = f"{declared.kind} {declared.labels[node]}: {group.parameters_of(node)[k]}"
                     unit = declared.unit_of(node, k)
-                    add(at[i, k], full, declared.kind, unit, values[i, k], deviation[i, k], starts[i, k], STATES[FREE])
+                    state = STATES[declared.states[declared.offsets[node] + k]]
+                    add(at[i, k], full, declared.kind, unit, values[i, k], deviation[i, k], starts[i, k], state)
     arrays = {k: np.array(v, dtype=float if k in ("value", "sigma", "initial") else object) for k, v in columns.items()}
     return Table({k: v[np.argsort(order, kind="stable")] for k, v in arrays.items()})
 

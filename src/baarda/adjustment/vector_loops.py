@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
-COMPILE_FROM = 200_000  # observations from which the loops are compiled
+COMPILE_FROM = 100_000  # observations from which the loops are compiled
 
 
 def _times(jacobian: Floats, nodes: Ints, table: Ints, x: Floats, first: Ints, out: Floats) -> None:
@@ -44,6 +44,34 @@ def _gathered(jacobian: Floats, nodes: Ints, table: Ints, y: Floats, first: Ints
             out[at[j]] += total
 
 
+def _times_many(jacobian: Floats, nodes: Ints, table: Ints, x: Floats, first: Ints, out: Floats) -> None:
+    """As `_times` for several vectors side by side, x (u + 1, k) and out (n, k)."""
+    n, m, w = jacobian.shape
+    k = x.shape[1]
+    for i in range(n):
+        at = table[nodes[i]]
+        for r in range(m):
+            row = out[first[i] + r]
+            for j in range(w):
+                value, own = jacobian[i, r, j], x[at[j]]
+                for c in range(k):
+                    row[c] += value * own[c]
+
+
+def _gathered_many(jacobian: Floats, nodes: Ints, table: Ints, y: Floats, first: Ints, out: Floats) -> None:
+    """As `_gathered` for several vectors side by side."""
+    n, m, w = jacobian.shape
+    k = y.shape[1]
+    for i in range(n):
+        at = table[nodes[i]]
+        for r in range(m):
+            row = y[first[i] + r]
+            for j in range(w):
+                value, own = jacobian[i, r, j], out[at[j]]
+                for c in range(k):
+                    own[c] += value * row[c]
+
+
 def _times_twin(jacobian: Floats, nodes: Ints, table: Ints, x: Floats, first: Ints, out: Floats) -> None:
     out[first[:, None] + np.arange(jacobian.shape[1])] += np.einsum("nmw,nw->nm", jacobian, x[table[nodes]])
 
@@ -60,6 +88,8 @@ class VectorLoops:
 
     times: Any
     gathered: Any
+    times_many: Any
+    gathered_many: Any
 
 
 @cache
@@ -72,13 +102,22 @@ def compiled() -> VectorLoops | None:
     for cached in (True, False):  # no place to write the cache
         try:
             jit = numba.njit(nogil=True, cache=cached, error_model="numpy")
-            return VectorLoops(jit(_times), jit(_gathered))
+            return VectorLoops(jit(_times), jit(_gathered), jit(_times_many), jit(_gathered_many))
         except RuntimeError:
             continue
     return None
 
 
-TWINS = VectorLoops(_times_twin, _gathered_twin)
+def _times_many_twin(jacobian: Floats, nodes: Ints, table: Ints, x: Floats, first: Ints, out: Floats) -> None:
+    out[first[:, None] + np.arange(jacobian.shape[1])] += np.einsum("nmw,nwk->nmk", jacobian, x[table[nodes]])
+
+
+def _gathered_many_twin(jacobian: Floats, nodes: Ints, table: Ints, y: Floats, first: Ints, out: Floats) -> None:
+    for own, column in zip(out.T, y.T, strict=True):
+        _gathered_twin(jacobian, nodes, table, column, first, False, own)
+
+
+TWINS = VectorLoops(_times_twin, _gathered_twin, _times_many_twin, _gathered_many_twin)
 
 
 def vector_loops(count: int) -> VectorLoops:

@@ -7,6 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
 from typing import Any, TypeVar
 
 from baarda.distributions.workers import worker_count
@@ -22,7 +23,7 @@ def for_each(items: Sequence[S], function: Callable[[S], T], workers: int | None
     ----------
     items : sequence
     function : callable
-        It should release the interpreter lock.
+        It should release the interpreter lock, and not use `for_each` itself.
     workers : int, optional
         Number of threads; one for each core.
 
@@ -36,18 +37,24 @@ def for_each(items: Sequence[S], function: Callable[[S], T], workers: int | None
         for item in items:
             yield function(item)
         return
-    with ThreadPoolExecutor(threads) as pool:
-        window: deque[Future[T]] = deque()
-        try:
-            for item in items:
-                window.append(pool.submit(function, item))
-                if len(window) > 4 * threads:
-                    yield window.popleft().result()
-            while window:
+    pool = _pool(threads)
+    window: deque[Future[T]] = deque()
+    try:
+        for item in items:
+            window.append(pool.submit(function, item))
+            if len(window) > 4 * threads:
                 yield window.popleft().result()
-        finally:
-            for left in window:
-                left.cancel()
+        while window:
+            yield window.popleft().result()
+    finally:
+        for left in window:
+            left.cancel()
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """One pool for all calls: to begin threads costs more than many a task."""
+    return ThreadPoolExecutor(threads)
 
 
 def run_tree(before: Sequence[int], after: Sequence[Sequence[int]], function: Callable[[int], Any], workers: int | None = None) -> None:

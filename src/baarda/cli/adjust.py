@@ -12,18 +12,23 @@ from baarda.cli.base import (
     Alpha,
     AlphaOutlier,
     CameraList,
+    CameraPositionsFile,
     Components,
     ComponentsBy,
     Control,
+    Covariance,
     CriterionB,
     CrossValidate,
     DatumName,
     FormatName,
     ImageSigma,
     Json,
+    LeverArm,
     MinRays,
     Out,
     Plane,
+    PointsFile,
+    PositionModel,
     Power,
     Quiet,
     Robust,
@@ -41,6 +46,7 @@ from baarda.cli.base import (
     guarded,
 )
 from baarda.cli.run import adjust_and_report
+from baarda.errors import UsageError
 
 
 @app.command()
@@ -50,6 +56,9 @@ def adjust(
     out: Out = None,
     format: FormatName = None,
     control: Control = None,
+    camera_positions: CameraPositionsFile = None,
+    lever_arm: LeverArm = "0,0,0",
+    position_model: PositionModel = "none",
     camera: CameraList = "source",
     image_sigma: ImageSigma = None,
     datum: DatumName = None,
@@ -72,6 +81,8 @@ def adjust(
     sigma: SigmaName = "aposteriori",
     seed: Seed = 0,
     tables: Tables = "csv",
+    covariance: Covariance = None,
+    points: PointsFile = None,
     as_json: Json = False,
     quiet: Quiet = False,
     strict: Strict = False,
@@ -81,6 +92,12 @@ def adjust(
 
     started = time.perf_counter()
     network = read(source, format=format, control=control)
+    if camera_positions is not None:
+        from baarda.formats.camera_positions import with_camera_positions
+
+        network = with_camera_positions(network, camera_positions, lever_arm, position_model)
+    elif lever_arm != "0,0,0" or position_model != "none":
+        raise UsageError("--lever-arm and --position-model belong to --camera-positions")
     settings = {
         "camera": camera_list(camera, network),
         "image_sigma": image_sigma,
@@ -101,7 +118,7 @@ def adjust(
         "strategy": strategy,
     }
     components = components_by if variance_components or components_by != "group" else None
-    adjust_and_report(network, settings, levels, target, tables, as_json, quiet, strict, started, plan, components)
+    adjust_and_report(network, settings, levels, target, tables, as_json, quiet, strict, started, plan, components, covariance, points)
 
 
 def camera_list(text: str, network: Any) -> str | tuple[str, ...] | None:

@@ -23,6 +23,20 @@ app = typer.Typer(
 
 Out = Annotated[Path | None, typer.Option("--out", help="Result folder to write; there whole or not at all.", show_default=False)]
 Control = Annotated[Path | None, typer.Option("--control", help="Table of control and check points.", show_default=False)]
+CameraPositionsFile = Annotated[
+    Path | None,
+    typer.Option("--camera-positions", help="Table of measured camera positions (GNSS) with their sigmas.", show_default=False),
+]
+LeverArm = Annotated[
+    str, typer.Option("--lever-arm", help="From projection centre to antenna, camera axes: x,y,z (known), free, or free:x,y,z.")
+]
+PositionModel = Annotated[str, typer.Option("--position-model", help="Estimated for each strip of positions: none, shift or drift.")]
+Covariance = Annotated[
+    Path | None, typer.Option("--covariance", help="Folder to write the covariances of the unknowns to.", show_default=False)
+]
+PointsFile = Annotated[
+    Path | None, typer.Option("--points", help="File (.csv, .geojson) to write the adjusted points and sigmas to.", show_default=False)
+]
 FormatName = Annotated[
     str | None, typer.Option("--format", help="Format of the source; by default recognised by content.", show_default=False)
 ]

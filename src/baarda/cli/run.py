@@ -11,7 +11,7 @@ from typing import Any
 
 import typer
 
-from baarda.errors import UsageError
+from baarda.errors import OutputError, UsageError
 
 
 def adjust_and_report(
@@ -26,9 +26,12 @@ def adjust_and_report(
     started: float,
     plan: dict[str, Any] | None = None,
     components: Any = None,
+    covariance: Path | None = None,
+    points: Path | None = None,
 ) -> None:
     """Adjust a network with the procedures of a plan, test it, write the folder, print verdict or JSON, leave with the exit code."""
     from baarda.adjustment import adjust as adjust_network
+    from baarda.formats import covariance_file, geojson
     from baarda.formats.folder import check_target
     from baarda.hypotheses.levels import Options
     from baarda.procedures.strategy import Plan, carry_out
@@ -41,6 +44,10 @@ def adjust_and_report(
     options = Options(**levels)
     if out is not None:
         check_target(out, MARK)
+    if covariance is not None:
+        check_target(covariance, covariance_file.MARK)
+    if points is not None and points.exists():
+        raise OutputError(f"{points} exists")
 
     def progress(step: Any) -> None:
         relative = "" if step.relative_step is None else f"  relative step {step.relative_step:.1e}"
@@ -64,6 +71,10 @@ def adjust_and_report(
     if not quiet:
         typer.echo("testing and writing ...", err=True)
     analysis = replace(analyse(result, options), strategy=strategy, components=found)
+    if result.status == "converged" and points is not None:
+        geojson.write_points(result, points, options.sigma)
+    if result.status == "converged" and covariance is not None:
+        covariance_file.write_covariance(result, covariance, sigma=options.sigma)
     if out is not None:
         write_folder(analysis, out, tables, {"seconds": round(time.perf_counter() - started, 3)})
     if as_json:

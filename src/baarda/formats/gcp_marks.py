@@ -21,7 +21,7 @@ Ints = NDArray[np.intp]
 
 GROUP = "control marks"
 #: formats whose pixels count from the corner of the first one, so that its centre lies at (0.5, 0.5)
-FROM_CORNER = ("colmap", "nvm", "metashape", "openmvg")
+FROM_CORNER = ("colmap", "metashape")
 
 
 def first_pixel(network: Network) -> float:

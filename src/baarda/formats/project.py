@@ -290,7 +290,7 @@ def _read_observations(
         code = np.array([index[name] for name in names], dtype=np.intp)
         usual = np.array([np.nan if g.sigma is None else g.sigma for g in groups.values()])[code]
         if kind in KIND_TABLES:
-            everything = KIND_TABLES[kind].read(table, usual, points, header.unit, declared)
+            everything = KIND_TABLES[kind].read(table, usual, images, points, header.unit, declared)
         else:
             everything = _READERS[kind](table, usual, images, points, header.unit, notes)
         for i, group in enumerate(groups.values()):

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from baarda.cameras import FIXED, FREE, STATES
 from baarda.errors import InputError, UsageError
 from baarda.formats.base import label_problem
-from baarda.formats.checks import sigma_range
+from baarda.formats.checks import correlations, sigma_range
 from baarda.formats.csv_table import CsvTable, numbers_text, quoted
-from baarda.network import Declared, Network, Points
-from baarda.observations import Angles, Directions, HeightDifferences, Stations
+from baarda.network import AXES, Declared, Images, Network, Points
+from baarda.observations import Angles, CameraPositions, Directions, HeightDifferences, LeverArms, Stations, Strips
 
 Floats = NDArray[np.float64]
 Columns = dict[str, list[str]]
@@ -69,7 +69,7 @@ class KindTable:
             out[column] = [labels[i] for i in getattr(group, attribute).tolist()]
         return {**out, "value": numbers_text(group.values), "sigma": numbers_text(group.sigmas)}
 
-    def read(self, table: CsvTable | None, usual: Floats, points: Points, unit: str, declared: tuple[Declared, ...]) -> Any:
+    def read(self, table: CsvTable | None, usual: Floats, images: Images, points: Points, unit: str, declared: tuple[Declared, ...]) -> Any:
         """Return all rows of a table as one group, checked; an empty one without a table.
 
         Raises
@@ -97,19 +97,77 @@ class KindTable:
         return self.group(**codes, **dict(zip(self.points.values(), ends, strict=True)), values=values, sigmas=sigma, **more)
 
 
-KIND_TABLES = {
+_PAIRS = ((0, 1), (0, 2), (1, 2))
+_CORRELATIONS = tuple(f"correlation_{AXES[i]}{AXES[j]}" for i, j in _PAIRS)
+
+
+@dataclass(frozen=True)
+class PositionTable:
+    """How camera positions are written: image, nodes of lever arm and strip, time, coordinates, standard deviations, correlations."""
+
+    kind: str = "camera_positions"
+    name: str = "camera positions"
+    group: type[Any] = CameraPositions
+
+    @property
+    def columns(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Required and optional columns."""
+        return ("image", "lever_arm", "strip", "time", *AXES), ("group", *(f"sigma_{a}" for a in AXES), *_CORRELATIONS)
+
+    def write(self, group: CameraPositions, network: Network) -> Columns:
+        """Return the columns of a group."""
+        arms, lines = (next(d for d in network.declared if d.kind == kind).labels for kind in ("lever_arm", "strip"))
+        sigma = group.sigma()
+        correlation = [group.covariances[:, i, j] / (sigma[:, i] * sigma[:, j]) for i, j in _PAIRS]
+        return {
+            "group": [quoted(group.name)] * len(group),
+            "image": [quoted(network.images.labels[i]) for i in group.images.tolist()],
+            "lever_arm": [quoted(arms[i]) for i in group.arms.tolist()],
+            "strip": [quoted(lines[i]) for i in group.lines.tolist()],
+            "time": numbers_text(group.times),
+            **{a: numbers_text(group.values[:, k]) for k, a in enumerate(AXES)},
+            **{f"sigma_{a}": numbers_text(sigma[:, k]) for k, a in enumerate(AXES)},
+            **{name: numbers_text(r) for name, r in zip(_CORRELATIONS, correlation, strict=True)},
+        }
+
+    def read(
+        self, table: CsvTable | None, usual: Floats, images: Images, points: Points, unit: str, declared: tuple[Declared, ...]
+    ) -> CameraPositions:
+        """Return all rows of a table as one group, checked; an empty one without a table."""
+        if table is None:
+            nothing = np.zeros(0, dtype=np.intp)
+            return CameraPositions(nothing, nothing, nothing, np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)), unit)
+        nodes = {d.kind: {t: i for i, t in enumerate(d.labels)} for d in declared}
+        image = table.codes("image", {t: i for i, t in enumerate(images.labels)}, "image")
+        arm, line = (table.codes(kind, nodes.get(kind, {}), kind.replace("_", " ")) for kind in ("lever_arm", "strip"))
+        values = np.stack([table.numbers(a, None) for a in AXES], axis=1)
+        sigma = np.stack([table.sigmas(f"sigma_{a}") for a in AXES], axis=1)
+        sigma = np.where(np.isnan(sigma), usual[:, None], sigma)
+        _refuse(table, np.asarray((~(sigma > 0.0)).any(axis=1)), "the sigmas of a camera position must be there and positive")
+        sigma_range(sigma, "the sigma of a camera position", table.error)
+        r = np.stack([table.numbers(name, 0.0) for name in _CORRELATIONS], axis=1)
+        correlations(r, table.error)
+        c = np.broadcast_to(np.eye(3), (len(image), 3, 3)).copy()
+        for k, (i, j) in enumerate(_PAIRS):
+            c[:, i, j] = c[:, j, i] = r[:, k]
+        c = c * sigma[:, :, None] * sigma[:, None, :]
+        return CameraPositions(image, arm, line, table.numbers("time", None), values, c, unit)
+
+
+KIND_TABLES: dict[str, KindTable | PositionTable] = {
     t.kind: t
     for t in (
+        PositionTable(),
         KindTable("directions", Directions, {"from": "starts", "to": "ends"}, {"station": ("sets", "station")}, in_units=False),
         KindTable("angles", Angles, {"from": "starts", "back": "backs", "fore": "fores"}, {}, in_units=False),
         KindTable("height_differences", HeightDifferences, {"from": "starts", "to": "ends"}, {}, in_units=True),
     )
 }
-DECLARED: dict[str, type[Declared]] = {"station": Stations}
+DECLARED: dict[str, type[Declared]] = {"station": Stations, "lever_arm": LeverArms, "strip": Strips}
 DECLARED_COLUMNS = (("kind", "node", "parameter", "value"), ("unit", "state"))
 
 
-def kind_table_of(group: Any) -> KindTable:
+def kind_table_of(group: Any) -> KindTable | PositionTable:
     """Return the table of an observation group.
 
     Raises

@@ -64,3 +64,22 @@ class TangentFrame:
     def local(self, lla: Floats) -> Floats:
         """Return east, north, up of latitude, longitude (degrees) and ellipsoidal height, (n, 3) to (n, 3)."""
         return np.asarray((geocentric(lla) - self.origin) @ self.rotation.T)
+
+    def geographic(self, local: Floats) -> Floats:
+        """Return latitude, longitude (degrees) and ellipsoidal height of east, north, up, (n, 3) to (n, 3).
+
+        Examples
+        --------
+        >>> frame = TangentFrame(52.0, 13.0, 40.0)
+        >>> frame.geographic(frame.local(np.array([[52.001, 13.002, 55.0]]))).round(12)
+        array([[52.001, 13.002, 55.   ]])
+        """
+        x, y, z = (np.asarray(local, dtype=float) @ self.rotation + self.origin).T
+        p = np.hypot(x, y)
+        latitude = np.arctan2(z, p * (1.0 - _E2))
+        for _ in range(8):  # contracts by e^2 per step
+            n = A / np.sqrt(1.0 - _E2 * np.sin(latitude) ** 2)
+            latitude = np.arctan2(z + _E2 * n * np.sin(latitude), p)
+        n = A / np.sqrt(1.0 - _E2 * np.sin(latitude) ** 2)
+        height = p * np.cos(latitude) + z * np.sin(latitude) - A**2 / n  # exact at the poles, too
+        return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), height], axis=1)

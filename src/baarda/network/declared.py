@@ -10,14 +10,14 @@ transformation of the object space (`shifted`, `similarity`), where the defaults
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from baarda.cameras import FIXED, FREE
+from baarda.cameras import FIXED, FREE, OBSERVED
 from baarda.errors import UsageError
 
 Floats = NDArray[np.float64]
@@ -44,7 +44,9 @@ class Declared:
     values : (total,) array
         Start or adjusted values, node by node.
     states : (total,) int8 array
-        0 fixed, 2 free.
+        0 fixed, 1 observed, 2 free.
+    given, sigmas : (total,) arrays
+        Directly observed values and their standard deviations; NaN elsewhere.
     """
 
     kind: str
@@ -53,10 +55,15 @@ class Declared:
     units: tuple[tuple[str, ...], ...]
     values: Floats
     states: States
+    given: Floats = field(default_factory=lambda: np.zeros(0))
+    sigmas: Floats = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        for name, dtype in (("values", float), ("states", np.int8)):
-            view = np.asarray(getattr(self, name), dtype=dtype).view()
+        for name, dtype in (("values", float), ("states", np.int8), ("given", float), ("sigmas", float)):
+            array = np.asarray(getattr(self, name), dtype=dtype)
+            if name in ("given", "sigmas") and not array.size:
+                array = np.full(len(self.values), np.nan)
+            view = array.view()
             view.flags.writeable = False
             object.__setattr__(self, name, view)
         if self.kind in RESERVED:
@@ -66,12 +73,27 @@ class Declared:
         total = int(self.offsets[-1])
         if self.values.shape != (total,) or self.states.shape != (total,):
             raise UsageError(f"{self.kind}: {total} parameters, but values {self.values.shape} and states {self.states.shape}")
-        if not np.isin(self.states, (FIXED, FREE)).all():
-            raise UsageError(f"{self.kind}: a parameter must be fixed or free")
+        if self.given.shape != (total,) or self.sigmas.shape != (total,):
+            raise UsageError(f"{self.kind}: {total} parameters, but given values {self.given.shape} and sigmas {self.sigmas.shape}")
+        if not np.isin(self.states, (FIXED, OBSERVED, FREE)).all():
+            raise UsageError(f"{self.kind}: a parameter must be fixed, observed or free")
+        bad = np.flatnonzero((self.states == OBSERVED) & ~(np.isfinite(self.given) & (self.sigmas > 0.0) & np.isfinite(self.sigmas)))
+        if len(bad):
+            node = int(np.searchsorted(self.offsets, bad[0], side="right")) - 1
+            name = self.parameters_of(node)[int(bad[0] - self.offsets[node])]
+            raise UsageError(f"{self.kind} {self.labels[node]}: {name} is observed, but has no given value with a positive sigma")
 
     @classmethod
     def make(
-        cls, kind: str, labels: Sequence[str], parameters: Sequence[str], units: Sequence[str], values: Any, states: Any = None
+        cls,
+        kind: str,
+        labels: Sequence[str],
+        parameters: Sequence[str],
+        units: Sequence[str],
+        values: Any,
+        states: Any = None,
+        given: Any = None,
+        sigmas: Any = None,
     ) -> Self:
         """Make a group whose nodes all have the same parameters, from (nodes, width) values; free unless states say otherwise.
 
@@ -83,7 +105,8 @@ class Declared:
         """
         values = np.asarray(values, dtype=float).reshape(len(labels), len(parameters))
         states = np.full(values.shape, FREE, dtype=np.int8) if states is None else np.asarray(states, dtype=np.int8).reshape(values.shape)
-        return cls(kind, tuple(labels), (tuple(parameters),), (tuple(units),), values.ravel(), states.ravel())
+        known = (np.zeros(0) if a is None else np.asarray(a, dtype=float).reshape(values.shape).ravel() for a in (given, sigmas))
+        return cls(kind, tuple(labels), (tuple(parameters),), (tuple(units),), values.ravel(), states.ravel(), *known)
 
     @cached_property
     def widths(self) -> Ints:
@@ -103,6 +126,27 @@ class Declared:
     def unit_of(self, node: int, k: int) -> str:
         """Return the unit of parameter k of a node."""
         return self.units[node if len(self.units) > 1 else 0][k]
+
+    def parameters_of(self, node: int) -> tuple[str, ...]:
+        """Return the parameter names of one node."""
+        return self.parameters[node if len(self.parameters) > 1 else 0]
+
+    def named(self, node: int, name: str) -> int:
+        """Return the position of a named parameter of a node in the values.
+
+        Raises
+        ------
+        UsageError
+            If the node has no such parameter.
+        """
+        names = self.parameters_of(node)
+        if name not in names:
+            raise UsageError(f"{self.kind} {self.labels[node]} has no parameter {name!r}; it has {', '.join(names)}")
+        return int(self.offsets[node]) + names.index(name)
+
+    def removable(self) -> NDArray[np.bool_]:
+        """Return which parameters are zero where they are not needed, (total,): those that a selection may delete; none by default."""
+        return np.zeros(len(self.values), dtype=bool)
 
     def moved(self, step: Floats) -> Self:
         """Return the group after increments of all parameters, (total,); zero for fixed ones."""

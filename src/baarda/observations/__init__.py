@@ -2,16 +2,19 @@
 
 from baarda.observations.angles import Angles
 from baarda.observations.base import Block, Kind, Rows
+from baarda.observations.camera_positions import CameraPositions, LeverArms, Strips, lever_arms, strips
 from baarda.observations.direct import CorrelatedPoints, Direct, direct_observations
 from baarda.observations.directions import Directions, Stations, stations
 from baarda.observations.distances import Distances
 from baarda.observations.height_differences import HeightDifferences
 from baarda.observations.image_coordinates import ImageCoordinates
 from baarda.observations.image_points import ImagePoints
+from baarda.observations.range_doppler import RangeDoppler, Tracks, tracks
 
 __all__ = [
     "Angles",
     "Block",
+    "CameraPositions",
     "CorrelatedPoints",
     "Direct",
     "Directions",
@@ -20,8 +23,15 @@ __all__ = [
     "ImageCoordinates",
     "ImagePoints",
     "Kind",
+    "RangeDoppler",
+    "LeverArms",
     "Rows",
     "Stations",
+    "Tracks",
+    "Strips",
     "direct_observations",
+    "lever_arms",
     "stations",
+    "tracks",
+    "strips",
 ]

@@ -46,12 +46,16 @@ class Rows:
     blocks : tuple of Block
     cofactor : (N, m, m) array, or (N, m)
         Covariance matrix of each row block for unit variance factor; of uncorrelated rows the variances suffice.
+    condition : (N, k, m) array or None
+        Of a combined model with fewer conditions (k) than observations (m): the partials of the conditions with respect to the
+        observations; misclosures and partials are those of `baarda.observations.combined.rows`.
     """
 
     index: Ints
     misclosure: Floats
     blocks: tuple[Block, ...]
     cofactor: Floats
+    condition: Floats | None = None
 
 
 class Kind(Protocol):

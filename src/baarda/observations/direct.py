@@ -10,6 +10,7 @@ import numpy as np
 from baarda.cameras import OBSERVED
 from baarda.geometry import rotation as rot
 from baarda.network import AXES, CONTROL, EXTERIOR, Network, State
+from baarda.network.parameters import _observed as observed_nodes
 from baarda.observations.base import Block, Floats, Ints, Rows
 
 
@@ -20,9 +21,9 @@ class Direct:
     Attributes
     ----------
     name : str
-        ``camera parameters``, ``image orientation`` or ``control points``.
+        ``camera parameters``, ``image orientation``, ``control points``, or that of a declared group: ``track parameters``.
     kind : str
-        Unknown group: camera, image or point.
+        Unknown group: camera, image, point, or a declared one.
     nodes, positions : (n,) int arrays
         Node and position of the parameter within the node.
     values, sigmas : (n,) arrays
@@ -67,6 +68,9 @@ class Direct:
         if self.kind == "image":
             values = np.concatenate([state.position, rot.to_angles(state.rotation)], axis=1)
             return np.asarray(values[self.nodes, self.positions])
+        if self.kind != "camera":
+            group = state[self.kind]
+            return np.asarray(group.values[group.offsets[self.nodes] + self.positions])
         return np.array([state.cameras[n][k] for n, k in zip(self.nodes, self.positions, strict=True)])
 
     def misclosures(self, network: Network, state: State) -> Floats:
@@ -165,4 +169,13 @@ def direct_observations(network: Network, active: Any) -> list[Direct | Correlat
     i = np.flatnonzero(correlated)
     if len(i):
         out.append(CorrelatedPoints(i, points.given[i], points.covariance(i), network.unit))
+    for group in network.declared:
+        used = observed_nodes(network, group, np.asarray(active))
+        node = np.repeat(np.arange(len(group.labels)), group.widths)
+        i = np.flatnonzero((group.states == OBSERVED) & used[node])
+        if len(i):
+            at = i - group.offsets[node[i]]
+            names = tuple(group.parameters_of(n)[k] for n, k in zip(node[i].tolist(), at.tolist(), strict=True))
+            width = group.widths[node[i]]
+            out.append(Direct(f"{group.kind} parameters", group.kind, node[i], at, group.given[i], group.sigmas[i], width, names, ""))
     return out

@@ -184,7 +184,9 @@ def critical_values(
 
 def statistics_of(adjustment: Adjustment) -> StatisticsOf:
     """Return the map from whitened errors (n, k) to w (n, k) and v'Pv (k,)."""
-    root = np.sqrt(adjustment._statistics["pqvvp"])[:, None]
+    pqvvp = adjustment._statistics["pqvvp"]
+    # Uncontrolled observations have no w; rounding may leave their cofactor a little below zero.
+    root = np.sqrt(np.where(adjustment.controlled_share >= UNCONTROLLED, pqvvp, np.nan))[:, None]
     correlated = [c for c in adjustment.lin.chunks if c.factor.shape[1] > 1 and np.any(np.tril(c.factor, -1))]
 
     def statistics(errors: Floats) -> tuple[Floats, Floats]:

@@ -50,7 +50,10 @@ class Planned:
 
     @cached_property
     def mdb(self) -> Floats:
-        """Minimal detectable biases of all observations, each in its unit; NaN where nothing controls it."""
+        """Minimal detectable biases of all n scalar observations by their a-priori sigmas, each in the unit of its own observation.
+
+        Pixels, metres and radians stand in one array: take medians and maxima by unit. NaN where no other observation controls it.
+        """
         share, pqvvp = self.adjustment.controlled_share, np.asarray(self.adjustment.evidence.pqvvp)
         return mdb(share / np.where(self.controlled, pqvvp, 1.0), share, 1.0, self.options.alpha_outlier, self.options.power)
 

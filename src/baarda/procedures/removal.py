@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 Key = tuple[int, int, int]
 
-CAMERA, IMAGE, POINT = -1, -2, -3
+CAMERA, IMAGE, POINT, DECLARED = -1, -2, -3, -4  # of the declared groups the first; the others follow downwards
 _CODES = {"camera": CAMERA, "image": IMAGE, "point": POINT}
 
 
@@ -35,13 +35,14 @@ def _grid(source: int, rows: int, components: int) -> Ints:
     return out
 
 
-def direct_keys(group: Direct | CorrelatedPoints) -> Ints:
+def direct_keys(group: Direct | CorrelatedPoints, network: Network) -> Ints:
     """Return the (rows, components, 3) keys of directly observed values."""
     if isinstance(group, CorrelatedPoints):
         out = _grid(POINT, len(group), 3)
         out[:, :, 1] = group.nodes[:, None]
         return out
-    return np.stack([np.full(len(group), _CODES[group.kind]), group.nodes, group.positions], axis=1)[:, None, :]
+    codes = {**_CODES, **{d.kind: DECLARED - i for i, d in enumerate(network.declared)}}
+    return np.stack([np.full(len(group), codes[group.kind]), group.nodes, group.positions], axis=1)[:, None, :]
 
 
 def without(network: Network, removed: Iterable[Key]) -> tuple[Network, list[Ints]]:
@@ -102,7 +103,13 @@ def _without_direct(network: Network, gone: dict[int, list[tuple[int, int]]]) ->
         roles = np.array(points.roles)
         roles[at[:, 0]] = np.where((states[at[:, 0]] == FREE).all(axis=1), TIE, roles[at[:, 0]])
         points = replace(points, states=states, roles=roles)
-    return replace(network, cameras=tuple(cameras), images=images, points=points)
+    declared = list(network.declared)
+    for i, d in enumerate(declared):
+        if DECLARED - i in gone:
+            states, at = np.array(d.states), np.array(gone[DECLARED - i])
+            states[d.offsets[at[:, 0]] + at[:, 1]] = FREE
+            declared[i] = replace(d, states=states)
+    return replace(network, cameras=tuple(cameras), images=images, points=points, declared=tuple(declared))
 
 
 def keys_of(adjustment: Adjustment, keys: Sequence[Ints]) -> Ints:
@@ -120,7 +127,8 @@ def keys_of(adjustment: Adjustment, keys: Sequence[Ints]) -> Ints:
         keep = np.all([active[end] for end in group.points_of()], axis=0)
         if keep.any():
             out.append(names[keep].reshape(-1, 3))
-    out += [direct_keys(g).reshape(-1, 3) for g in adjustment.groups[len(out) :] if isinstance(g, (Direct, CorrelatedPoints))]
+    direct = [g for g in adjustment.groups[len(out) :] if isinstance(g, (Direct, CorrelatedPoints))]
+    out += [direct_keys(g, adjustment.network).reshape(-1, 3) for g in direct]
     return np.concatenate(out)
 
 
@@ -219,7 +227,7 @@ def predict(adjustment: Adjustment, base: Network, keys: Sequence[Key]) -> Predi
             (part, {(source, int(r), c): (i, c) for i, r in enumerate(chosen) for c in range(len(part.components))}),
         )
     for group in direct:
-        table = direct_keys(group)
+        table = direct_keys(group, base)
         parts.append((group, {tuple(table[i, c].tolist()): (i, c) for i in range(table.shape[0]) for c in range(table.shape[1])}))
     for part, places in parts:
         here = {j: places[key] for j, key in enumerate(keys) if key in places}

@@ -252,8 +252,8 @@ class Experiment:
         e = self._adjusted(changed, reference).evidence
         from scipy import stats
 
-        with np.errstate(divide="ignore", invalid="ignore"):
-            w = np.where(self.planned.controlled, np.abs(np.asarray(e.pv)) / np.sqrt(np.asarray(e.pqvvp)), -np.inf)
+        seen = self.planned.controlled
+        w = np.where(seen, np.abs(np.asarray(e.pv)) / np.sqrt(np.where(seen, np.asarray(e.pqvvp), 1.0)), -np.inf)
         limit = float(stats.norm.isf(self.options.alpha_outlier / 2.0))
         return float(row), float(w[row] > limit), float(w[row] == w.max())
 
@@ -302,7 +302,7 @@ def errors_of(truth: State, result: Adjustment) -> Floats:
     state, out = State.of(result.network), np.empty(result.numbering.count)
     turn = rot.log(state.rotation @ truth.rotation.transpose(0, 2, 1)) if len(state.rotation) else np.zeros((0, 3))
     parts = {
-        "camera": np.concatenate([a - b for a, b in zip(state.cameras, truth.cameras, strict=True)]),
+        "camera": np.concatenate([np.zeros(0), *(a - b for a, b in zip(state.cameras, truth.cameras, strict=True))]),
         "image": np.concatenate([state.position - truth.position, turn], axis=1).ravel(),
         "point": (state.points - truth.points).ravel(),
     }

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from baarda.network import AXES
-from baarda.observations import ImagePoints
+from baarda.observations import Direct, ImagePoints
 from baarda.procedures.planning import Planned
 from baarda.procedures.proof import Proof
 from baarda.report.sections._numbers import column, finer, fixed, names, plural, significant
@@ -43,8 +44,8 @@ def prediction(planned: Planned) -> dict[str, Any]:
     out: dict[str, Any] = {
         "points": {
             "count": int(free.sum()),
-            "median": {axis: median(sigmas[free, k]) for k, axis in enumerate(AXES)},
-            "largest": {axis: largest(sigmas[free, k]) for k, axis in enumerate(AXES)},
+            "median": {axis: median(sigmas[sigmas[:, k] > 0.0, k]) for k, axis in enumerate(AXES)},
+            "largest": {axis: largest(sigmas[sigmas[:, k] > 0.0, k]) for k, axis in enumerate(AXES)},
             "weakest": [str(points["point"][i]) for i in np.argsort(-spatial, kind="stable")[:5] if free[i]],
         },
         "images": {f"median_s{name}": median(images[f"s{name}"]) for name in ("X0", "Y0", "Z0", "omega_rad", "phi_rad", "kappa_rad")},
@@ -60,9 +61,24 @@ def prediction(planned: Planned) -> dict[str, Any]:
             "largest_px": largest(bias[seen]),
             "median_in_sigma": median((bias / a.sigmas)[seen]),
         },
+        "mdb_other": {
+            unit: {"count": len(at), "median": median(bias[at]), "largest": largest(bias[at])}
+            for unit, at in _other_rows(planned, image_rows).items()
+        },
         "external_reliability": {"median": median(table["external"][planned.controlled]), "largest": largest(table["external"])},
         "correlations": [{"a": x, "b": y, "value": v} for x, y, v in a.camera_correlations()],
     }
+    return out
+
+
+def _other_rows(planned: Planned, image_rows: NDArray[np.bool_]) -> dict[str, list[int]]:
+    """Return the controlled observations that are no image points, by the unit of their group; rows of mixed units are left out."""
+    out: dict[str, list[int]] = {}
+    a = planned.adjustment
+    for g, group in enumerate(a.groups):
+        rows = [i for i in range(a.offsets[g], a.offsets[g + 1]) if planned.controlled[i] and not image_rows[i]]
+        if rows and not isinstance(group, Direct):
+            out.setdefault(str(group.unit), []).extend(rows)
     return out
 
 
@@ -100,7 +116,9 @@ def sentences(planned: Planned, proof: Proof | None) -> list[Sentence]:
     p = figures["points"]
     if p["count"]:
         unit, factor = finer(a.network.unit, [v for v in p["median"].values() if v is not None])
-        told = column([(v or 0.0) * factor for d in (p["median"], p["largest"]) for v in d.values()], 2)
+        wanted = [v for d in (p["median"], p["largest"]) for v in d.values()]
+        known = iter(column([v * factor for v in wanted if v is not None], 2))
+        told = ["fixed" if v is None else next(known) for v in wanted]
         out.append(
             Sentence(
                 "precision",
@@ -132,6 +150,26 @@ def sentences(planned: Planned, proof: Proof | None) -> list[Sentence]:
             power=f"{o.power:g}",
             level=f"{o.alpha_outlier:g}",
             most=significant(m["largest_px"]),
+        )
+        out.append(Sentence("reliability", text, "warn" if r["uncontrolled"] else "info", "reliability"))
+    elif figures["mdb_other"]:
+        text = say(
+            "Redundancy numbers average {mean}; found with power {power} at level {level} are biases from {biases} on.",
+            mean=fixed(r["mean"], 3),
+            power=f"{o.power:g}",
+            level=f"{o.alpha_outlier:g}",
+            biases=names(
+                [
+                    say(
+                        "{median} {unit} (median; largest {most} {unit})",
+                        median=significant(v["median"]),
+                        most=significant(v["largest"]),
+                        unit=u,
+                    )
+                    for u, v in figures["mdb_other"].items()
+                ],
+                4,
+            ),
         )
         out.append(Sentence("reliability", text, "warn" if r["uncontrolled"] else "info", "reliability"))
     if r["uncontrolled"]:
@@ -196,8 +234,13 @@ def _proof_sentences(p: Proof) -> list[Sentence]:
     out.append(Sentence("global", text, "good" if p.objective.holds else "bad", "proof"))
     told = [x for x in p.sizes if x.told]
     wrong = [f"{x.name} ({100 * x.rate:.3g} % instead of {100 * x.expected:.3g} %)" for x in told if not x.holds]
-    words = say("{wrong} of them not: {names}", wrong=len(wrong), names=names(wrong)) if wrong else "none deviates beyond chance"
-    text = say("{count} tests of true hypotheses reject as often as their level says; {words}.", count=len(told) - len(wrong), words=words)
+    words = say("not so: {names}", names=names(wrong)) if wrong else "none deviates beyond chance"
+    text = say(
+        "{count} of {all} tests of true hypotheses reject as often as their level says; {words}.",
+        count=len(told) - len(wrong),
+        all=len(told),
+        words=words,
+    )
     if told:
         out.append(Sentence("sizes", text, "bad" if wrong else "good", "proof"))
     few = [x.name for x in p.sizes if not x.told]

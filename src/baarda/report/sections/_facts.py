@@ -60,6 +60,19 @@ def unit_of(analysis: Analysis, row: int) -> str:
     return str(group.unit)
 
 
+def rows_by_unit(analysis: Analysis, rows: Ints) -> dict[str, Ints]:
+    """Return scalar observations by their unit, in the order in which the units appear: numbers of different units are never mixed."""
+    a = analysis.adjustment
+    out: dict[str, list[int]] = {}
+    known: dict[int, str] = {}
+    places = np.searchsorted(a.offsets, rows, side="right") - 1
+    for row, g in zip(rows.tolist(), places.tolist(), strict=True):
+        # Directly observed values have units of their own, row by row.
+        unit = unit_of(analysis, row) if isinstance(a.groups[g], Direct) else known.setdefault(g, unit_of(analysis, row))
+        out.setdefault(unit, []).append(row)
+    return {unit: np.array(at, dtype=np.intp) for unit, at in out.items()}
+
+
 def label_of(analysis: Analysis, row: int) -> str:
     """Return the name of a scalar observation: image, point and component; its group where it is no image coordinate."""
     a, table = analysis.adjustment, analysis.observations
@@ -129,9 +142,22 @@ def sensor_residuals(analysis: Analysis, camera: int) -> tuple[Floats, Floats]:
 
 
 def correlation_matrix(cofactors: Floats) -> Floats:
-    """Return the correlations of a cofactor matrix."""
-    s = np.sqrt(np.maximum(np.diag(cofactors), np.finfo(float).tiny))
+    """Return the correlations of a cofactor matrix; NaN (told as missing) where a variance is not positive."""
+    q = np.diag(cofactors)
+    s = np.sqrt(np.where(q > 0.0, q, np.nan))
     return np.asarray(cofactors / s[:, None] / s[None, :])
+
+
+def deviations_of(variances: Floats, of: Floats) -> Floats:
+    """Return standard deviations of differences of variances: zero up to rounding in the variances `of` that they are parts of, NaN below.
+
+    Examples
+    --------
+    >>> deviations_of(np.array([4.0, -1e-17, -0.1]), np.ones(3))
+    array([ 2.,  0., nan])
+    """
+    rounded = np.where(np.abs(variances) <= 1e-10 * of, 0.0, variances)
+    return np.sqrt(np.where(rounded >= 0.0, rounded, np.nan))
 
 
 def point_sigmas(analysis: Analysis) -> tuple[Any, Floats]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from baarda.procedures.testing import Analysis
+from baarda.report.translation import current, tr
 
 Tone = Literal["", "good", "warn", "bad", "info"]
 
@@ -111,7 +112,26 @@ class Figure:
     svg: str
 
 
-Block = Paragraph | Items | Verdict | DataTable | Figure
+@dataclass(frozen=True)
+class Interactive:
+    """A view in space that a page with scripts lets the reader turn; a figure before it shows the same without.
+
+    Attributes
+    ----------
+    name, title, caption, alt : str
+        As those of a figure.
+    data : str
+        The scene, see `baarda.report.scene.Scene.to_json`.
+    """
+
+    name: str
+    title: str
+    caption: str
+    alt: str
+    data: str
+
+
+Block = Paragraph | Items | Verdict | DataTable | Figure | Interactive
 
 
 @dataclass(frozen=True)
@@ -146,7 +166,7 @@ class SectionMaker:
     def make(self, analysis: Analysis) -> Section | None:
         """Return the section of an analysis, None where it does not apply."""
         blocks = self.build(analysis)
-        return Section(self.id, self.title, tuple(blocks)) if blocks else None
+        return translated(Section(self.id, self.title, tuple(blocks))) if blocks else None
 
 
 def say(template: str, **fields: Any) -> str:
@@ -168,4 +188,50 @@ def say(template: str, **fields: Any) -> str:
     >>> say("{count} of {total} observations", count=3, total=40)
     '3 of 40 observations'
     """
-    return template.format(**fields)
+    return tr(template).format(**fields)
+
+
+#: Columns whose cells are names from the source: never translated.
+_NAMES = {"point", "image", "camera", "from", "to", "observation", "parameter", "unknown", "a", "b"}
+
+
+def translated(section: Section) -> Section:
+    """Return a section with its fixed texts in the current language: titles, captions, columns, words in cells.
+
+    Sentences with fields were translated when they were filled, see `say`; names from the source stay as they are.
+
+    Parameters
+    ----------
+    section : Section
+
+    Returns
+    -------
+    Section
+
+    Examples
+    --------
+    >>> translated(Section("verdict", "Verdict", ())).title
+    'Verdict'
+    """
+    if current() == "en":
+        return section
+    return replace(section, title=tr(section.title), blocks=tuple(_translated(b) for b in section.blocks))
+
+
+def _translated(block: Block) -> Block:
+    if isinstance(block, Paragraph):
+        return replace(block, text=tr(block.text))
+    if isinstance(block, Items):
+        return replace(block, intro=tr(block.intro), entries=tuple(tr(e) for e in block.entries))
+    if isinstance(block, Verdict):
+        return Verdict(tuple(replace(s, subject=tr(s.subject), text=tr(s.text)) for s in block.sentences))
+    if isinstance(block, (Figure, Interactive)):
+        return replace(block, title=tr(block.title), caption=tr(block.caption), alt=tr(block.alt))
+    said = [c.name not in _NAMES for c in block.columns]
+    rows = tuple(tuple(_word(cell) if told else cell for cell, told in zip(row, said, strict=True)) for row in block.rows)
+    columns = tuple(replace(c, name=tr(c.name), unit=tr(c.unit), meaning=tr(c.meaning)) for c in block.columns)
+    return replace(block, caption=tr(block.caption), note=tr(block.note), columns=columns, rows=rows)
+
+
+def _word(cell: str | Cell) -> str | Cell:
+    return replace(cell, text=tr(cell.text)) if isinstance(cell, Cell) else tr(cell)

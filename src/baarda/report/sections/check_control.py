@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from baarda.hypotheses.base import Estimates, TestResult
 from baarda.network import AXES
 from baarda.procedures.testing import Analysis
-from baarda.report.sections._facts import MOST_ROWS, first, result_of, scaling
+from baarda.report.sections._facts import MOST_ROWS, deviations_of, first, result_of, scaling
 from baarda.report.sections._numbers import MISSING, decimals_for, finer, fixed, plural, probability, significant
 from baarda.report.sections.base import Block, Cell, Column, DataTable, SectionMaker, Tone, say
 
@@ -118,7 +118,7 @@ def _prior_and_posterior(analysis: Analysis, e: Estimates) -> list[Block]:
     scale = analysis.adjustment.scale(analysis.options.sigma)
     prior, qvv = np.diag(e.reference_covariance), np.diag(e.cofactors)
     posterior = prior - qvv
-    by_prior, by_posterior = (_by_point(e, scale * np.sqrt(np.maximum(q, 0.0))) for q in (prior, posterior))
+    by_prior, by_posterior = (_by_point(e, scale * deviations_of(q, prior)) for q in (prior, posterior))
     shares = _by_point(e, qvv / prior)
     unit, factor = finer(analysis.adjustment.network.unit, np.sqrt(prior) * scale)
     decimals = decimals_for(np.sqrt(prior) * scale * factor, 3)
@@ -183,7 +183,9 @@ def _build(analysis: Analysis) -> list[Block] | None:
     e = analysis.evidence.control
     if e is not None and len(e.values):
         words = ("residual v = adjusted - given", say("standard deviation of this residual, {scaling}", scaling=scaling(analysis)))
-        deviations = scale * np.sqrt(np.maximum(np.diag(e.cofactors), 0.0))
+        variances = np.diag(e.cofactors)
+        whole = variances if e.reference_covariance is None else np.diag(e.reference_covariance)
+        deviations = scale * deviations_of(variances, whole)
         blocks += _joint(result_of(analysis, "control_points"), "control coordinates are right")
         blocks.append(_differences(analysis, "control", e, deviations, words, "tables/observations.csv"))
         blocks += _prior_and_posterior(analysis, e)

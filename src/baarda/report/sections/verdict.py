@@ -16,10 +16,11 @@ from baarda.report.sections._facts import (
     label_of,
     point_sigmas,
     result_of,
+    rows_by_unit,
     spatial,
     unit_of,
 )
-from baarda.report.sections._numbers import column, finer, fixed, names, plural, probability, significant
+from baarda.report.sections._numbers import column, finer, fixed, names, plural, powers, probability, significant
 from baarda.report.sections.base import Block, SectionMaker, Sentence, Tone, Verdict, say
 
 
@@ -185,21 +186,45 @@ def _hidden(analysis: Analysis) -> Sentence | None:
     what = "image coordinate"
     if not len(rows):
         rows, what = np.arange(analysis.adjustment.count), "observation"
-    values = analysis.observations["mdb"][rows]
+    bias = analysis.observations["mdb"]
     lost = int(np.isnan(analysis.w).sum())
-    if not np.isfinite(values).any():
+    rows = rows[np.isfinite(bias[rows])]
+    if not len(rows):
         return Sentence("Reliability", say("No {what} is controlled by others: gross errors cannot be found.", what=what), "bad", "groups")
-    at = int(rows[int(np.nanargmax(values))])
-    text = say(
-        "A gross error in an {what} is found with probability {power} from {median} {unit} on (median, by the a-priori sigmas); the "
-        "least controlled one, {label}, may hide up to {most} {unit}.",
-        what=what,
-        power=fixed(analysis.options.power, 2),
-        median=significant(float(np.nanmedian(values)), 2),
-        most=significant(float(np.nanmax(values)), 2),
-        unit=unit_of(analysis, at),
-        label=label_of(analysis, at),
-    )
+    parts = rows_by_unit(analysis, rows)
+    worst = {unit: int(at[int(np.argmax(bias[at]))]) for unit, at in parts.items()}
+    power = fixed(analysis.options.power, 2)
+    if len(parts) == 1:
+        (unit, at), row = next(iter(parts.items())), next(iter(worst.values()))
+        text = say(
+            "A gross error in an {what} is found with probability {power} from {median} {unit} on (median, by the a-priori sigmas); the "
+            "least controlled one, {label}, may hide up to {most} {unit}.",
+            what=what,
+            power=power,
+            median=significant(float(np.median(bias[at])), 2),
+            most=significant(float(bias[row]), 2),
+            unit=unit,
+            label=label_of(analysis, row),
+        )
+    else:
+        text = say(
+            "A gross error is found with probability {power} from {medians} on (medians by unit, by the a-priori sigmas); the least "
+            "controlled ones may hide up to {hidden}.",
+            power=power,
+            medians=names(
+                [
+                    say(
+                        "{median} {unit} ({rows})",
+                        median=significant(float(np.median(bias[at])), 2),
+                        unit=powers(u),
+                        rows=plural(len(at), what),
+                    )
+                    for u, at in parts.items()
+                ],
+                5,
+            ),
+            hidden=names([f"{significant(float(bias[i]), 2)} {powers(u)} ({label_of(analysis, i)})" for u, i in worst.items()], 5),
+        )
     if lost:
         text += " " + say(
             "{count} controlled by no other: an error there stays hidden, whatever its size.",
@@ -215,9 +240,12 @@ def _precision(analysis: Analysis) -> Sentence | None:
         return None
     whole = spatial(sigmas)
     weakest = int(np.argmax(np.where(free, whole, -1.0)))
-    medians = np.median(sigmas[free], axis=0)
-    unit, factor = finer(analysis.adjustment.network.unit, sigmas[free])
-    shown = column(np.append(medians, whole[weakest]) * factor, 2)
+    # Coordinates of one axis may all be fixed, as heights of a network in the plane.
+    medians = [float(np.median(s[s > 0.0])) if (s > 0.0).any() else float("nan") for s in sigmas.T]
+    unit, factor = finer(analysis.adjustment.network.unit, sigmas[sigmas > 0.0])
+    known = np.append(medians, whole[weakest]) * factor
+    told = iter(column(known[np.isfinite(known)], 2))
+    shown = [next(told) if np.isfinite(value) else "fixed" for value in known]
     text = say(
         "The object points have standard deviations of {x} / {y} / {z} {unit} in X / Y / Z (medians, {scaling}); the weakest is point "
         "{name} with {most} {unit} in space.",
