@@ -617,3 +617,59 @@ assert kernels.compiled() is not None
 """
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert out.returncode == 0, out.stderr
+
+
+# ---- interruptions ----
+PHASES = {
+    "linearisation": "baarda.observations.image_points.ImagePoints.linearize_piece",
+    "trial": "baarda.observations.image_points.ImagePoints.misclosures_of_piece",
+    "pattern": "baarda.adjustment.solve.analyse",
+    "factor": "baarda.adjustment.lapack.cholesky",
+    "solution": "baarda.adjustment.block.BlockSolver.solve",
+    "inverse": "baarda.adjustment.lapack.invert_from_cholesky",
+    "tests": "baarda.procedures.testing.analyse",
+    "report": "baarda.report.page.html",
+}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signal")
+@pytest.mark.parametrize("phase", list(PHASES))
+def test_an_interruption_leaves_nothing(phase, tmp_path):
+    """SIGINT while a phase begins, in whatever thread: exit code 130, one line, no folder, no temporary file."""
+    code = """
+import importlib, os, signal, sys
+target, project, out = sys.argv[1:]
+parts = target.split(".")
+holder = None
+for i in range(len(parts) - 1, 0, -1):
+    try:
+        holder, rest = importlib.import_module(".".join(parts[:i])), parts[i:]
+        break
+    except ModuleNotFoundError:
+        continue
+for name in rest[:-1]:
+    holder = getattr(holder, name)
+original = getattr(holder, rest[-1])
+def interrupted(*args, **options):
+    os.kill(os.getpid(), signal.SIGINT)
+    return original(*args, **options)
+setattr(holder, rest[-1], interrupted)
+from baarda.cli import main
+sys.argv = ["baarda", "adjust", project, "--solver", "block", "--quiet", "--out", out]
+main()
+"""
+    project = tmp_path / "in" / "ring.txt"
+    project.parent.mkdir()
+    network = made("ring", images=5, points=30)
+    cams = tuple(
+        cameras.create(str(i), cameras.model("snavely"), {"principal_distance": 5500.0}, free=("principal_distance",)) for i in range(5)
+    )
+    baarda.formats.write(replace(network, cameras=cams, images=replace(network.images, cameras=np.arange(5))), project, "bal")
+    target = tmp_path / "out"
+    target.mkdir()
+    command = [sys.executable, "-c", code, PHASES[phase], str(project), str(target / "result")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 130, done.stderr
+    assert done.stderr.strip() == "baarda: interrupted, nothing was written"
+    assert not list(target.iterdir())
+    assert [p.name for p in project.parent.iterdir()] == ["ring.txt"]

@@ -148,3 +148,32 @@ def test_suspected_observations(solve):
     assert first[1:4] == ("410", "Y", 3.744)
     assert round(first[4], 3) == 0.109
     assert second[1:4] == ("492", "X", 3.003)
+
+
+def by_point(result, name):
+    """Return statistic, p-value and decision of each point, the worst first."""
+    t = next(t for t in baarda.test(result) if t.name == name)
+    rows = zip(t.labels, np.asarray(t.statistic), np.asarray(t.p_value), np.asarray(t.rejected), strict=True)
+    return {label: (float(s), float(p), bool(r)) for label, s, p, r in sorted(rows, key=lambda row: row[2])}
+
+
+def test_points_410_and_351_are_doubtful_as_check_points(script):
+    """The script withholds these two, and they fail: together F(6, 1913.8) = 11.99 (limit 2.10), each by itself."""
+    joint = next(t for t in baarda.test(script) if t.name == "check_points")
+    assert joint.rejected
+    assert joint.statistic == pytest.approx(11.993, abs=5e-3)
+    found = by_point(script, "check_point")
+    assert list(found) == ["410", "351"]
+    assert all(rejected for *_, rejected in found.values())
+    assert found["410"][0] == pytest.approx(20.75, abs=0.01)
+    assert found["351"][0] == pytest.approx(3.079, abs=2e-3)
+
+
+def test_points_410_and_351_are_doubtful_as_control(solve):
+    """As weighted control 410 is rejected first; 351 comes third, behind 492, and its image coordinates are the second largest."""
+    found = by_point(solve("w-op0"), "control_point")
+    assert list(found)[:3] == ["410", "492", "351"]
+    assert found["410"][2]
+    assert found["410"][1] < 1e-3
+    assert 0.05 < found["351"][1] < 0.10  # doubtful, not rejected
+    assert {point for _, point, *_ in extremes(solve("f-op0"), 3)} == {"410", "351"}

@@ -71,6 +71,6 @@ def test_adjustment(network):
 def test_round_trip(network, tmp_path):
     write(network, tmp_path / "out", "opensfm")
     again = read(tmp_path / "out")
-    assert len(again.points.labels) == 1430 + 2  # the point with one ray has no coordinates
+    assert len(again.points.labels) == 1430 + 3
     np.testing.assert_allclose(again.images.position, network.images.position, atol=1e-9)
     np.testing.assert_allclose(again.observations[0].xy[:3082], network.observations[0].xy, atol=1e-9)

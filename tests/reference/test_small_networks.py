@@ -134,6 +134,34 @@ def test_riva_with_weighted_control_rejects_the_unit_square(riva):
     result = baarda.adjust(replace(riva, points=weighted), camera=NINE, min_rays=2)
     assert (result.count, result.numbering.count, result.redundancy) == (3348, 411, 2937)
     assert result.sigma0 == pytest.approx(2.8246609, abs=5e-7)
+    # Fixed, the square adds 37086.4 - 23433.0 to v'Pv for its 12 - 7 = 5 conditions beyond a similarity: F(5, 2937) = 342.
+    fixed = baarda.adjust(riva, camera=NINE, min_rays=2)
+    growth = (fixed.objective - result.objective) / 5 / result.variance_factor
+    assert growth == pytest.approx(342.2, abs=0.1)
+    tests = {t.name: t for t in baarda.test(result)}
+    assert not tests["control_points"].rejected  # a millimetre is enough for the four corners
+
+
+def test_riva_the_control_test_rejects_the_square_where_it_is_held_fixed(riva):
+    """With a hundredth of a millimetre the corners are as good as fixed, but observed: the tests of control can judge them."""
+    from dataclasses import replace
+
+    p = riva.points
+    control = (p.roles == CONTROL)[:, None]
+    held = replace(p, states=np.where(control, OBSERVED, p.states), sigmas=np.where(control, 1e-5, p.sigmas))
+    result = baarda.adjust(replace(riva, points=held), camera=NINE, min_rays=2)
+    assert result.sigma0 == pytest.approx(3.439, abs=5e-4)
+    tests = {t.name: t for t in baarda.test(result)}
+    joint, each = tests["control_points"], tests["control_point"]
+    assert joint.rejected
+    assert joint.df[0] == 5.0  # a similarity takes seven of twelve coordinates
+    assert joint.statistic == pytest.approx(191.33, abs=0.01)
+    assert joint.critical == pytest.approx(2.2126, abs=5e-5)
+    assert each.rejected.all()
+    single = tests["additional_parameter"]
+    t = dict(zip((n.split(": ")[1] for n in single.labels), np.asarray(single.statistic), strict=True))
+    assert abs(t["K3"]) < 0.5
+    assert all(abs(t[k]) > 7.0 for k in ("K1", "K2", "P1", "P2", "B1"))
 
 
 @pytest.mark.parametrize("file", ["dubrovnik-3-7-pre.txt", "dubrovnik-3-7-18-pre.txt"])

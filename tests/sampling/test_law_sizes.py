@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import optimize, stats
 
 from baarda.distributions import fit, law
 from baarda.distributions.replicas import refit_columns
@@ -131,6 +131,76 @@ def test_homogeneity_of_separate_sets() -> None:
         exact(each[:, k], f"set {k}")
     assert np.all(paper <= corrected)
     assert sizes(paper) == pytest.approx([0.117, 0.060, 0.013], abs=0.015)
+
+
+def test_power_of_one_set_against_the_pooled_variance() -> None:
+    """A set of 1.5 times the standard deviation: r_i s_i^2 / S^2 is rho F(r_i, R - r_i) over the rest, so its power is known exactly."""
+    rng, df, rho = np.random.default_rng(114), np.array([12.0, 12.0, 12.0, 30.0]), 1.5**2
+    s2 = rng.chisquare(df, (REPLICAS, 4)) / df * np.array([rho, 1.0, 1.0, 1.0])
+    hit = np.array([variance_per_image(x, df).rejected[0] for x in s2])
+    total, r = df.sum(), df[0]
+    law = stats.beta(r / 2.0, (total - r) / 2.0)
+    low, high = (q / (1.0 - q) * (total - r) / r / rho for q in law.ppf([0.025, 0.975]))  # limits of s_1^2 over the rest's
+    expected = float(stats.f(r, total - r).sf(high) + stats.f(r, total - r).cdf(low))
+    assert 0.3 < expected < 0.9
+    assert abs((hit.mean() - expected) / np.sqrt(expected * (1.0 - expected) / REPLICAS)) <= 4.0
+
+
+def test_power_of_bartlett_for_two_sets() -> None:
+    """With two sets theta is a function of their variance ratio: the region of rejection in F gives the power exactly."""
+    rng, df, rho = np.random.default_rng(115), np.array([14.0, 22.0]), 2.2
+    s2 = rng.chisquare(df, (REPLICAS, 2)) / df * np.array([rho, 1.0])
+    hit = np.array([bool(bartlett(x, df).rejected) for x in s2])
+
+    def beyond(log_ratio: float) -> float:
+        t = bartlett(np.array([np.exp(log_ratio), 1.0]), df)
+        return float(t.statistic) - float(t.critical)
+
+    low, high = np.exp(optimize.brentq(beyond, -8.0, 0.0)), np.exp(optimize.brentq(beyond, 0.0, 8.0))
+    law = stats.f(*df)
+    assert float(law.cdf(low) + law.sf(high)) == pytest.approx(0.05, abs=2e-3)  # size of the corrected form
+    expected = float(law.cdf(low / rho) + law.sf(high / rho))
+    assert 0.2 < expected < 0.8
+    assert abs((hit.mean() - expected) / np.sqrt(expected * (1.0 - expected) / REPLICAS)) <= 4.0
+
+
+def test_power_of_groups_within_one_adjustment_follows_the_variance() -> None:
+    """Bartlett through R against one group of larger errors: the power grows from the level to certainty."""
+    rng, a = np.random.default_rng(116), ADJUSTMENT
+    df = np.bincount(a.groups, np.diag(a.projector))
+    member = (a.groups == np.arange(4)[:, None]).astype(float)
+
+    def theta(e: np.ndarray) -> np.ndarray:
+        s2 = member @ (a.projector @ e) ** 2 / df[:, None]
+        return np.asarray(df @ np.log((df @ s2) / df.sum() / s2))
+
+    limit = np.quantile(theta(rng.standard_normal((a.n, REPLICAS))), 0.95)
+    powers = []
+    for factor in (1.0, 2.0, 4.0, 8.0):
+        e = rng.standard_normal((a.n, REPLICAS)) * np.where(a.groups == 0, factor, 1.0)[:, None]
+        powers.append(float(np.mean(theta(e) > limit)))
+    assert abs(powers[0] - 0.05) <= 4.0 * np.sqrt(2 * 0.05 * 0.95 / REPLICAS)
+    assert powers == sorted(powers)
+    assert powers[1] > 0.10
+    assert powers[3] > 0.8
+
+
+@pytest.mark.parametrize("a", [-0.3, 0.5])
+def test_power_of_kurtosis_and_skewness_against_another_implementation(a: float) -> None:
+    """Against modulated normal values, and squares of normal ones: as often rejected as by SciPy's tests, on samples of its own."""
+    rng, n = np.random.default_rng(117), 150
+    member = law("modulated_normal")(a=a)
+    draws = [member.rvs(n * REPLICAS, rng).reshape(n, REPLICAS) for _ in range(2)]
+    ours = both(KurtosisLaw(n), _moments(draws[0])[:, 2]) <= 0.05
+    theirs = stats.kurtosistest(draws[1], axis=0).pvalue <= 0.05
+    assert 0.1 < ours.mean() < 0.999
+    assert abs(ours.mean() - theirs.mean()) <= 4.0 * np.sqrt(2 * theirs.mean() * (1 - theirs.mean()) / REPLICAS)
+    skew = [x + 0.08 * rng.standard_normal(x.shape) ** 2 * np.abs(x).mean() for x in (rng.standard_normal((n, REPLICAS)) for _ in range(2))]
+    skew = [x + 0.05 * x**2 for x in skew]
+    ours = both(SkewnessLaw(n), _moments(skew[0])[:, 1]) <= 0.05
+    theirs = stats.skewtest(skew[1], axis=0).pvalue <= 0.05
+    assert ours.mean() > 0.1
+    assert abs(ours.mean() - theirs.mean()) <= 4.0 * np.sqrt(2 * theirs.mean() * (1 - theirs.mean()) / REPLICAS)
 
 
 def test_brown_forsythe_is_approximate() -> None:

@@ -76,7 +76,7 @@ def assert_sizes(p_values):
 def test_sizes_of_check_and_control_points(aposteriori):
     model, found = Model(), {}
     axes, groups = list("XYZXYZ"), list("AAABBB")
-    for rng in streams(1, 1200):
+    for rng in streams(1, 4000):
         e = model.evidence(rng)
         factor, r = (e.variance_factor, float(e.redundancy)) if aposteriori else (1.0, np.inf)
         c, k = e.check, e.control
@@ -101,16 +101,18 @@ def test_power_of_check_and_control_points_and_axes():
     row = N - 2
     bias = np.zeros(N)
     bias[row] = 4.0 * model.root[row, row]
-    hits = {"points": [], "point": [], "horizontal": [], "control": []}
-    for rng in streams(2, 1200):
+    hits = {"points": [], "point": [], "horizontal": [], "control": [], "control by s0": []}
+    for rng in streams(2, 2000):
         e = model.evidence(rng)
         c = e.check
         hits["points"].append(check_points(c.values + move, c.cofactors, e.variance_factor, e.redundancy).rejected)
         hits["point"].append(check_point(c.values + move, c.cofactors, e.variance_factor, e.redundancy, list("AAABBB")).rejected[0])
         t = check_axis(c.values + move, c.cofactors, e.variance_factor, e.redundancy, list("XYZXYZ"), list("AAABBB"))
         hits["horizontal"].append(t.rejected[t.labels.index("horizontal")])
-        k = model.evidence(rng, bias).control
+        e = model.evidence(rng, bias)
+        k = e.control
         hits["control"].append(control_points(k.values, k.cofactors, 1.0, np.inf).rejected)
+        hits["control by s0"].append(control_points(k.values, k.cofactors, e.variance_factor, e.redundancy).rejected)
     q = c.cofactors
 
     def lam(at):
@@ -122,7 +124,13 @@ def test_power_of_check_and_control_points_and_axes():
         "horizontal": power_of_test(lam([0, 1, 3, 4]), 0.05, 4, model.r),
     }
     effect = model.evidence(np.random.default_rng(0), bias, 1e-9).control  # noncentrality: the form of the errorless residuals
-    expected["control"] = power_of_test(effect.values @ np.linalg.solve(effect.cofactors, effect.values), 0.05, CONTROL)
+    shown = effect.values @ np.linalg.solve(effect.cofactors, effect.values)
+    expected["control"] = power_of_test(shown, 0.05, CONTROL)
+    # Residuals of control are part of s0: R / v'Pv is a beta, that is F(d, r - d) of R against the rest; the bias shows in both.
+    rest = model.r - CONTROL
+    whole = float(model.evidence(np.random.default_rng(0), bias, 1e-9).vpv)
+    assert whole == pytest.approx(shown, rel=1e-6)  # the bias lies in the control alone
+    expected["control by s0"] = power_of_test(shown, 0.05, CONTROL, rest)
     for name, rates in hits.items():
         assert 0.1 < expected[name] < 0.995, (name, expected[name])
         assert abs(z_of(rates, expected[name])) <= 4.0, (name, np.mean(rates), expected[name])
@@ -142,7 +150,7 @@ def test_intervals_of_root_mean_squares_cover():
 
 def test_size_and_power_of_the_variance_ratio():
     rng = np.random.default_rng(4)
-    r1, r2, count = 17, 40, 3000
+    r1, r2, count = 17, 40, 4000
     a, b = rng.chisquare(r1, count) / r1, rng.chisquare(r2, count) / r2
     assert_sizes([variance_ratio(x, r1, y, r2).p_value for x, y in zip(a, b, strict=True)])
     law = stats.f(r1, r2)
@@ -201,6 +209,40 @@ def test_size_of_compare_on_whole_networks(control):
         ratio.append(c.variance_ratio.p_value)
     for p in (joint, single, ratio):
         assert_sizes(p)
+
+
+def test_size_and_power_of_variance_components_in_a_linear_model():
+    """4000 data sets of one geometry: three groups of 100, 80 and 60 observations, 20 unknowns; the law of one group is Satterthwaite's."""
+    rng = np.random.default_rng(8)
+    n, sizes_ = 240, (100, 80, 60)
+    basis, _ = np.linalg.qr(rng.standard_normal((n, 20)))
+    rest = np.eye(n) - basis @ basis.T
+    codes = np.repeat(np.arange(3), sizes_)
+    member = (codes == np.arange(3)[:, None]).astype(float)
+    traces = np.array([[float((rest[np.ix_(codes == i, codes == j)] ** 2).sum()) for j in range(3)] for i in range(3)])
+    names = ("a", "b", "c")
+    errors = rng.standard_normal((n, 4000))
+    forms = (member @ (rest @ errors) ** 2).T
+    assert_sizes([np.asarray(variance_component(q, traces, names).p_value) for q in forms])
+    assert_sizes([equal_variance_components(q, traces, names).p_value for q in forms])
+    wrong = errors * np.where(codes == 1, 1.25, 1.0)[:, None]
+    forms = (member @ (rest @ wrong) ** 2).T
+    single = np.array([np.asarray(variance_component(q, traces, names).rejected) for q in forms])
+    equal = np.mean([equal_variance_components(q, traces, names).rejected for q in forms])
+    # The form of group b is close to its chi-square times the true factor, the part from the other groups unchanged.
+    block = rest[np.ix_(codes == 1, codes == 1)]
+    mean = 1.25**2 * traces[1, 1] + traces[1, 0] + traces[1, 2]
+    spread = 2.0 * (
+        1.25**4 * float((block @ block * (block @ block)).sum()) + 2.0 * 1.25**2 * float((rest[codes == 1][:, codes != 1] ** 2 * 1.0).sum())
+    )
+    law = stats.chi2(traces[1].sum() ** 2 / traces[1, 1])
+    f = float(law.args[0])
+    own = stats.chi2(2.0 * mean**2 / spread, scale=spread / (2.0 * mean))
+    expected = own.sf(law.ppf(0.975) / f * traces[1].sum()) + own.cdf(law.ppf(0.025) / f * traces[1].sum())
+    assert abs(single[:, 1].mean() - expected) < 0.03
+    assert single[:, 1].mean() > 0.7
+    assert equal > 0.7
+    assert single[:, [0, 2]].mean() < 0.10
 
 
 def test_size_of_variance_components():

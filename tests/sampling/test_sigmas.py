@@ -8,10 +8,12 @@ from scipy import stats
 
 import baarda
 from baarda.network import State
+from baarda.procedures.synthetic import synthetic
 from networks import ring
 
 pytestmark = pytest.mark.sampling
 REPLICAS = 400
+BLOCK_REPLICAS = 200
 
 
 def truth_of(network):
@@ -83,3 +85,49 @@ def test_sigmas_of_residuals():
     level = 0.001 / len(ratio)
     low, high = stats.chi2(REPLICAS).ppf([level / 2, 1 - level / 2])
     assert ((ratio > low) & (ratio < high)).all()
+
+
+BLOCKS = {
+    "ring": lambda: synthetic("ring", images=6, points=40, control=6, noise=0.5, seed=4),
+    "aerial": lambda: synthetic("aerial", images=9, points=80, noise=0.5, seed=4),
+    "a camera per image": lambda: synthetic("aerial", images=9, points=80, noise=0.5, seed=4, per_image_cameras=True),
+    "long tracks": lambda: synthetic("long-tracks", images=8, points=40, noise=0.5, seed=4),
+}
+
+
+@pytest.mark.parametrize("name", list(BLOCKS))
+def test_block_solver_on_synthetic_blocks(name):
+    """Sigmas of all unknowns, of the joint covariance of an image and a point, and of v'Pv, from truth known beforehand.
+
+    Unlike above the prediction is made at the truth, and every replica starts from there.
+    """
+    truth = truth_of(BLOCKS[name]().truth)
+    prediction = baarda.adjust(truth, solver="block")
+    assert prediction.solver_name == "block"
+    table = prediction.unknown_table("apriori")
+    values, objective = [], []
+    for child in np.random.SeedSequence(30).spawn(BLOCK_REPLICAS):
+        r = baarda.adjust(disturbed(truth, np.random.default_rng(child)), solver="block")
+        assert r.status == "converged"
+        values.append(r.unknowns["value"])
+        objective.append(r.objective)
+    values = np.array(values)
+    angle = np.array([n.endswith(("omega", "phi", "kappa")) for n in table["name"]])
+    values[:, angle] = np.remainder(values[:, angle] - values[0, angle] + np.pi, 2 * np.pi) - np.pi
+    n = BLOCK_REPLICAS
+    ratio = values.var(axis=0, ddof=1) / table["sigma"] ** 2
+    level = 0.001 / len(ratio)
+    low, high = stats.chi2(n - 1).ppf([level / 2, 1 - level / 2]) / (n - 1)
+    outside = [f"{name}: {q:.3f}" for name, q in zip(table["name"], ratio, strict=True) if not low <= q <= high]
+    assert not outside, f"s^2/sigma^2 outside {low:.3f}..{high:.3f}: {outside}"
+    spread = np.sqrt(2.0 / (n - 1) * np.mean(_squared_correlations(prediction)))  # of the mean of all ratios
+    assert abs(ratio.mean() - 1.0) < 4 * spread
+    r = prediction.redundancy
+    assert abs(np.mean(objective) - r) < 4 * np.sqrt(2 * r / n)
+    assert stats.kstest(objective, stats.chi2(r).cdf).pvalue > 1e-4
+
+
+def _squared_correlations(adjusted):
+    """Squared correlations of all pairs of unknowns, by which sampled variances are correlated."""
+    q = adjusted.cofactors.of(np.arange(adjusted.numbering.count))
+    return q**2 / np.outer(np.diag(q), np.diag(q))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -551,6 +552,13 @@ def compiled() -> Kernels | None:
         return build(cached=True)
     except RuntimeError:  # no place to write the cache
         return build(cached=False)
+
+
+def cached() -> bool:
+    """Return whether compiled loops lie in numba's cache, or need not be compiled."""
+    loops = compiled()
+    path = loops and getattr(loops.accumulate.stats, "cache_path", None)
+    return not path or any(Path(path).glob("kernels._accumulate-*.nbi"))
 
 
 TWINS = Kernels(_accumulate_twin, _statistics_twin, _extend_twin, _gather_twin, compiled=False)

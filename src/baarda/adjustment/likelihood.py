@@ -124,7 +124,7 @@ def iterate(
         length, accepted = 1.0, False
         for _ in range(1 if damping > 0.0 else HALVINGS):  # Armijo's rule along Newton's step; the damped step is taken or not
             trial = state.moved(lin.unknowns, length * step)
-            v = whitened_misclosures(network, trial, groups)
+            v = whitened_misclosures(network, trial, groups, lin.workers)
             value, trial_scale = np.inf, scale
             if np.isfinite(v).all():
                 trial_scale = scale_of(v, law, r, scale)
@@ -144,7 +144,7 @@ def iterate(
             continue
         state, objective, scale = trial, value, trial_scale
         reach = np.clip(np.abs(length * change) / scale, *REACH)
-        lin = linearize(network, state, lin.unknowns, groups)
+        lin = linearize(network, state, lin.unknowns, groups, lin.workers)
         whole = damping == 0.0 and length == 1.0
         # steps that no longer shrink are rounding: an infinite psi'(0) enlarges it
         if whole and (relative <= settings.tolerance or (relative <= STALLED and relative >= 0.5 * last)):

@@ -61,12 +61,16 @@ class Part:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Whitened row blocks: first scalar row (N,), misclosures (N, m), parts, and the factors L (N, m, m) of the cofactors Q = L L'."""
+    """Whitened row blocks: first scalar row (N,), misclosures (N, m), parts, and the factors L (N, m, m) of the cofactors Q = L L'.
+
+    Of a combined model with fewer conditions than observations, `controlled` (N, m, m) projects onto what the conditions control.
+    """
 
     first: Ints
     misclosure: Floats
     parts: tuple[Part, ...]
     factor: Floats
+    controlled: Floats | None = None
 
     @property
     def rows(self) -> Ints:
@@ -141,8 +145,21 @@ class Linearization:
     values: Floats
     workers: int | None = None
 
+    @cached_property
+    def uncontrolled(self) -> int:
+        """How many combinations of observations no condition controls: they have no redundancy."""
+        return round(sum(c.misclosure.size - float(np.einsum("nii->", c.controlled)) for c in self.chunks if c.controlled is not None))
+
     def weighted(self, roots: Floats) -> Linearization:
-        """Return the system with its rows multiplied by the roots of their weights, (n,)."""
+        """Return the system with its rows multiplied by the roots of their weights, (n,).
+
+        Raises
+        ------
+        UsageError
+            If a combined model with fewer conditions than observations is in it.
+        """
+        if self.uncontrolled:
+            raise UsageError("a combined model with fewer conditions than observations cannot be adjusted under a law of errors")
         values = np.empty_like(self.values)
         chunks = []
         for c in self.chunks:
@@ -327,13 +344,14 @@ class _Filling:
     misclosure: Floats
     parts: list[Part]
     factors: dict[int, Floats]
+    controlled: dict[int, Floats]
 
     @staticmethod
     def of(rows: Rows, later: list[Any], first: Ints, unknowns: Unknowns, kept: Any, name: str) -> _Filling:
         """Plan a chunk from its first piece, and what computes the others."""
         nothing = np.zeros(0, dtype=np.intp)
         groups = [(unknowns[b.kind], kept.get((b.kind, b.jacobian.shape[2]), nothing)) for b in rows.blocks]
-        return _Filling(name, first, [rows], later, groups, np.empty((len(first), rows.misclosure.shape[1])), [], {})
+        return _Filling(name, first, [rows], later, groups, np.empty((len(first), rows.misclosure.shape[1])), [], {}, {})
 
     @property
     def size(self) -> int:
@@ -363,6 +381,9 @@ class _Filling:
             at = part.positions
             part.jacobian[some] = _apply(whiten, b.jacobian if len(at) == b.jacobian.shape[2] else b.jacobian[:, :, at])
         self.factors[start] = factor
+        if rows.condition is not None:
+            basis = np.linalg.qr((rows.condition @ factor).transpose(0, 2, 1))[0]
+            self.controlled[start] = basis @ basis.transpose(0, 2, 1)
 
     def chunk(self) -> Chunk:
         """Return the chunk; factors that are all equal are stored once."""
@@ -373,7 +394,8 @@ class _Filling:
             factor = np.broadcast_to(factors[0], (n, m, m))
         else:
             factor = np.concatenate([np.broadcast_to(f, (b - a, m, m)) for f, a, b in zip(factors, starts[:-1], starts[1:], strict=True)])
-        return Chunk(self.first, self.misclosure, tuple(self.parts), factor)
+        controlled = np.concatenate([self.controlled[k] for k in starts[:-1]]) if self.controlled else None
+        return Chunk(self.first, self.misclosure, tuple(self.parts), factor, controlled)
 
 
 def whitened_misclosures(network: Network, state: State, groups: Sequence[Kind] | Arrangement, workers: int | None = None) -> Floats:

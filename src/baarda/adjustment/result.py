@@ -64,7 +64,7 @@ class Adjustment:
         Its factor.
     datum : Datum
     redundancy : int
-        r = n - u + d.
+        r = n - u + d, less the combinations of observations that no condition of a combined model controls.
     history : tuple of Iteration
     status : {"converged", "not_converged"}
     aside : (points,) bool array
@@ -154,14 +154,14 @@ class Adjustment:
         with threadpool_limits(limits=1, user_api="blas"):
             hats = self.solver.hat()
         for c, hat in zip(self.lin.chunks, hats, strict=True):
-            if not c.correlated:
+            if not c.correlated and c.controlled is None:
                 sigma = np.einsum("nii->ni", c.factor)
                 share = 1.0 - np.einsum("nii->ni", hat)
                 found = (share * sigma**2, share, share / sigma**2, -c.misclosure / sigma, 1.0 / sigma**2)
                 for name, values in zip(("qvv", "redundancy", "pqvvp", "pv", "weight"), found, strict=True):
                     out[name][c.rows] = values
                 continue
-            rest = np.eye(hat.shape[1]) - hat
+            rest = (np.eye(hat.shape[1]) if c.controlled is None else c.controlled) - hat
             inverse = np.linalg.inv(c.factor)
             left = c.factor @ rest
             weighted = inverse.transpose(0, 2, 1)
@@ -194,6 +194,9 @@ class Adjustment:
         """Map standardised errors (n, k), whitened and independent, to standardised residuals -Qvv P e, each divided by its sigma."""
         with threadpool_limits(limits=1, user_api="blas"):
             white = self.lin.times(self.solver.solve(self.lin.transposed(errors))) - errors
+        for c in self.lin.chunks:
+            if c.controlled is not None:
+                white[c.rows] += errors[c.rows] - np.einsum("nij,nj...->ni...", c.controlled, errors[c.rows])
         correlated = [c for c in self.lin.chunks if c.correlated]
         for c in correlated:
             values = np.einsum("nij,njk->nik", c.factor, white[c.rows])
@@ -344,6 +347,24 @@ class Adjustment:
         q = self.cofactors.of(at) if len(at) else np.zeros((0, 0))
         return Estimates(tuple(names), np.array(values, dtype=float), 0.5 * (q + q.T), None, tuple(labels))
 
+    @cached_property
+    def additional_estimates(self) -> Estimates:
+        """Additional camera parameters, and what declared groups call removable, with their joint cofactors."""
+        cameras = self._camera_estimates(additional_only=True)
+        names, values, labels = list(cameras.names), cameras.values.tolist(), list(cameras.groups)
+        for d in self.network.declared:
+            removable, columns = d.removable(), self.numbering[d.kind].columns
+            for node, label in enumerate(d.labels):
+                for k, name in enumerate(d.parameters_of(node), int(d.offsets[node])):
+                    if removable[k] and columns[k] >= 0:
+                        names.append(f"{d.kind} {label}: {name}")
+                        values.append(float(d.values[k]))
+                        labels.append(label)
+        if len(names) == len(cameras.names):
+            return cameras
+        q = self.cofactors.of(np.array([self.numbering.column(name) for name in names], dtype=np.intp))
+        return Estimates(tuple(names), np.array(values), 0.5 * (q + q.T), None, tuple(labels))
+
     def _check_estimates(self) -> Estimates | None:
         points = self.network.points
         rows, axes = np.nonzero(((points.roles == CHECK) & ~self.aside)[:, None] & np.isfinite(points.given))
@@ -401,7 +422,7 @@ class Adjustment:
         kinds = (ImageCoordinates, ImagePoints)
         image_rows = np.concatenate([np.full(len(g) * len(g.components), isinstance(g, kinds)) for g in self.groups])
         interior = self.camera_estimates
-        additional = self._camera_estimates(additional_only=True)
+        additional = self.additional_estimates
         evidence = Evidence(
             residuals=self.residuals,
             sigmas=self.sigmas,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from baarda.adjustment import kernels, memory
 from baarda.adjustment.block import BlockSolver
 from baarda.adjustment.camera_choice import with_cameras
 from baarda.adjustment.datum import Datum, Defect, find_defect, minimal_columns
@@ -61,6 +62,10 @@ class Settings:
         start (a of the modulated normal, nu of Student's law) or take their usual value.
     progress : callable or None
         Is told every iteration.
+    tell : callable or None
+        Is told in words what takes time or memory.
+    jobs : int or None
+        Number of threads; None = one for each core. The results do not depend on it.
     """
 
     datum: Literal["auto", "control", "inner", "minimal"] = "auto"
@@ -74,6 +79,8 @@ class Settings:
     robust: str | None = None
     robust_shapes: Mapping[str, float] | None = field(default=None, hash=False)
     progress: Callable[[Iteration], None] | None = field(default=None, compare=False)
+    tell: Callable[[str], None] | None = field(default=None, compare=False)
+    jobs: int | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         for name, allowed in (("datum", ("auto", "control", "inner", "minimal")), ("solver", ("auto", "dense", "block"))):
@@ -81,6 +88,8 @@ class Settings:
                 raise UsageError(f"{name} must be one of {', '.join(allowed)}, not {getattr(self, name)!r}")
         if self.iterations < 1 or not 0 < self.tolerance < 1e-2:
             raise UsageError("iterations must be positive, the tolerance between 0 and 0.01")
+        if self.jobs is not None and self.jobs < 1:
+            raise UsageError(f"the number of threads (--jobs) must be positive, not {self.jobs}")
         if self.min_rays < 0:
             raise UsageError(f"min_rays must not be negative, not {self.min_rays}")
         if self.image_sigma is not None and not 1e-12 < self.image_sigma < 1e12:
@@ -143,18 +152,26 @@ def _adjust(network: Network, settings: Settings) -> Adjustment:
 
     start = State.of(prepared)
     kind = settings.solver if settings.solver != "auto" else "dense" if unknowns.count <= DENSE_LIMIT else "block"
+    memory.check(
+        memory.of_rows(unknowns, groups) + (memory.of_dense(unknowns) if kind == "dense" else 0.0), "the observations", settings.tell
+    )
     rank = rank_of_points(start.points)
     arranged = Arrangement.of(groups, rank if kind == "block" else None)
-    lin = linearize(prepared, start, unknowns, arranged)
+    lin = linearize(prepared, start, unknowns, arranged, settings.jobs)
     check_finite(lin, groups, prepared)
     defect = find_defect(lin, start)
-    redundancy = lin.count - unknowns.count + defect.count
+    redundancy = lin.count - lin.uncontrolled - unknowns.count + defect.count
     if redundancy <= 0:
+        lost = f", {lin.uncontrolled} combinations of them controlled by no condition" if lin.uncontrolled else ""
         raise RedundancyNotPositive(
-            f"redundancy {redundancy}: n = {lin.count} observations, u = {unknowns.count} unknowns, "
+            f"redundancy {redundancy}: n = {lin.count} observations{lost}, u = {unknowns.count} unknowns, "
             f"datum defect d = {defect.count}; a test needs r = n - u + d > 0"
         )
     structure = analyse(lin, rank, start.points) if kind == "block" else None
+    if structure is not None:
+        memory.check(memory.of_fronts(structure), "the factor and its inverse", settings.tell)
+        if settings.tell is not None and len(structure.block_row) >= kernels.COMPILE_FROM and not kernels.cached():
+            settings.tell("compiling loops for the first time, about half a minute (see: baarda warmup)")
 
     def factor(lin: Linearization, datum: Datum, damping: float = 0.0) -> Solver:
         if structure is None:
@@ -324,11 +341,12 @@ def _iterate(
     floor = lin.count * 1e-8  # residuals of 1e-4 sigma count as none
     history = [Iteration(0, objective, None, 0.0, True)]
     damping, growth, last, curved = 0.0, 2.0, np.inf, False
+    stalled = 0
     before: Floats | None = None  # the last full step, as a change of the observations
 
     def misclosures(step: Floats) -> tuple[State, Floats, float]:
         trial = state.moved(lin.unknowns, step, centres_of_rays(groups.groups, state))
-        values = whitened_misclosures(network, trial, groups)
+        values = whitened_misclosures(network, trial, groups, lin.workers)
         return trial, values, float(values @ values) if np.isfinite(values).all() else np.inf
 
     tied = datum
@@ -361,8 +379,9 @@ def _iterate(
             continue
         state, objective = trial, value
         before = change if damping == 0.0 and lengthened == 1.0 else None
-        lin = linearize(network, state, lin.unknowns, groups)
-        settled = relative <= settings.tolerance or (relative <= 1e-7 and relative >= 0.5 * last)
+        lin = linearize(network, state, lin.unknowns, groups, lin.workers)
+        stalled = stalled + 1 if relative <= 1e-7 and relative >= 0.8 * last else 0
+        settled = relative <= settings.tolerance or stalled == 2 or (relative < 1e-9 and relative >= 0.5 * last)  # only rounding is left
         if settled and (damping == 0.0 or _full_step(lin, tied, factor) <= 1e-6):
             return state, lin, history, True
         damping *= max(0.5 if curved else 0.2, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)

@@ -11,6 +11,7 @@ import typer
 from baarda.cli.base import (
     Alpha,
     AlphaOutlier,
+    AuditFlag,
     CameraList,
     CameraPositionsFile,
     Components,
@@ -22,10 +23,13 @@ from baarda.cli.base import (
     DatumName,
     FormatName,
     ImageSigma,
+    Jobs,
     Json,
+    Language,
     LeverArm,
     MinRays,
     Out,
+    Pdf,
     Plane,
     PointsFile,
     PositionModel,
@@ -66,6 +70,7 @@ def adjust(
     residual_plane: Plane = None,
     robust: Robust = None,
     min_rays: MinRays = None,
+    audit: AuditFlag = False,
     snoop: Snoop = False,
     snoop_unit: SnoopUnit = "coordinate",
     snoop_law: SnoopLaw = None,
@@ -80,7 +85,10 @@ def adjust(
     power: Power = 0.80,
     sigma: SigmaName = "aposteriori",
     seed: Seed = 0,
+    jobs: Jobs = None,
     tables: Tables = "csv",
+    spoken: Language = "en",
+    pdf: Pdf = False,
     covariance: Covariance = None,
     points: PointsFile = None,
     as_json: Json = False,
@@ -106,6 +114,7 @@ def adjust(
         "residual_plane": residual_plane,
         "robust": robust,
         "min_rays": min_rays,
+        "jobs": jobs,
     }
     levels = {"alpha": alpha, "alpha_outlier": alpha_outlier, "power": power, "sigma": sigma, "seed": seed}
     target = None if as_json and out is None else out or Path("baarda-out")
@@ -118,7 +127,24 @@ def adjust(
         "strategy": strategy,
     }
     components = components_by if variance_components or components_by != "group" else None
-    adjust_and_report(network, settings, levels, target, tables, as_json, quiet, strict, started, plan, components, covariance, points)
+    files = {"covariance": covariance, "points": points}
+    adjust_and_report(
+        network,
+        settings,
+        levels,
+        target,
+        tables,
+        as_json,
+        quiet,
+        strict,
+        started,
+        plan,
+        components,
+        audit=audit,
+        spoken=spoken,
+        pdf=pdf,
+        **files,
+    )
 
 
 def camera_list(text: str, network: Any) -> str | tuple[str, ...] | None:

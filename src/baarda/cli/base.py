@@ -31,6 +31,7 @@ LeverArm = Annotated[
     str, typer.Option("--lever-arm", help="From projection centre to antenna, camera axes: x,y,z (known), free, or free:x,y,z.")
 ]
 PositionModel = Annotated[str, typer.Option("--position-model", help="Estimated for each strip of positions: none, shift or drift.")]
+AuditFlag = Annotated[bool, typer.Option("--audit", help="Evaluate the source's own solution as it stands, beside the rigorous one.")]
 Covariance = Annotated[
     Path | None, typer.Option("--covariance", help="Folder to write the covariances of the unknowns to.", show_default=False)
 ]
@@ -92,7 +93,10 @@ AlphaOutlier = Annotated[float, typer.Option("--alpha-outlier", help="Level of t
 Power = Annotated[float, typer.Option("--power", help="Power behind minimal detectable biases.")]
 SigmaName = Annotated[str, typer.Option("--sigma", help="Which variance factor judges and scales: aposteriori (tau) or apriori (w).")]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of simulated null laws.")]
+Jobs = Annotated[int | None, typer.Option("--jobs", help="Threads; the results do not depend on it.", min=1, show_default="all cores")]
 Tables = Annotated[str, typer.Option("--tables", help="Format of the tables: csv or parquet.")]
+Language = Annotated[str, typer.Option("--language", help="Language of the report and the verdict: en or de.")]
+Pdf = Annotated[bool, typer.Option("--pdf", help="Write report.pdf, too (extra pdf).")]
 Json = Annotated[bool, typer.Option("--json", help="Print result.json to stdout; the folder is written only with --out.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress and no verdict.")]
 Strict = Annotated[bool, typer.Option("--strict", help="Exit with 1 when the global, outlier, check point or control point test rejects.")]

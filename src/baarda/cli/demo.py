@@ -8,8 +8,11 @@ from pathlib import Path
 from baarda.cli.base import (
     Alpha,
     AlphaOutlier,
+    Jobs,
     Json,
+    Language,
     Out,
+    Pdf,
     Power,
     Quiet,
     Seed,
@@ -37,7 +40,10 @@ def demo(
     power: Power = 0.80,
     sigma: SigmaName = "aposteriori",
     seed: Seed = 0,
+    jobs: Jobs = None,
     tables: Tables = "csv",
+    spoken: Language = "en",
+    pdf: Pdf = False,
     as_json: Json = False,
     quiet: Quiet = False,
     strict: Strict = False,
@@ -54,4 +60,6 @@ def demo(
     levels = {"alpha": alpha, "alpha_outlier": alpha_outlier, "power": power, "sigma": sigma, "seed": seed}
     target = None if as_json and out is None else out or Path("demo-out")
     plan = {"snoop": "coordinate" if snoop else None, "select": select}
-    adjust_and_report(network, {"solver": solver}, levels, target, tables, as_json, quiet, strict, started, plan)
+    adjust_and_report(
+        network, {"solver": solver, "jobs": jobs}, levels, target, tables, as_json, quiet, strict, started, plan, spoken=spoken, pdf=pdf
+    )

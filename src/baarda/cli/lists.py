@@ -13,9 +13,12 @@ from baarda.cli.base import app, guarded
 @guarded
 def warmup() -> None:
     """Compile the kernels once, so that later runs find them cached."""
+    from baarda.adjustment.warmup import warm_up
     from baarda.distributions.kernels import compiled
+    from baarda.procedures.synthetic import ring
 
-    typer.echo("kernels are compiled" if compiled() is not None else "numba is not installed: the slower NumPy twins are used")
+    done = compiled() is not None and warm_up(ring(6, points=30).network)
+    typer.echo("kernels are compiled" if done else "numba is not installed: the slower NumPy twins are used")
 
 
 @app.command()

@@ -28,6 +28,9 @@ def adjust_and_report(
     components: Any = None,
     covariance: Path | None = None,
     points: Path | None = None,
+    audit: bool = False,
+    spoken: str = "en",
+    pdf: bool = False,
 ) -> None:
     """Adjust a network with the procedures of a plan, test it, write the folder, print verdict or JSON, leave with the exit code."""
     from baarda.adjustment import adjust as adjust_network
@@ -37,10 +40,17 @@ def adjust_and_report(
     from baarda.procedures.strategy import Plan, carry_out
     from baarda.procedures.testing import analyse
     from baarda.report import page
+    from baarda.report.pdf import check_pdf
     from baarda.report.result_folder import MARK, result_json, write_folder
+    from baarda.report.translation import check_language, language
 
     if tables not in ("csv", "parquet"):
         raise UsageError(f"--tables is csv or parquet, not {tables!r}")
+    check_language(spoken)
+    if pdf:
+        check_pdf()
+        if out is None:
+            raise UsageError("--pdf writes into the result folder: give --out")
     options = Options(**levels)
     if out is not None:
         check_target(out, MARK)
@@ -62,27 +72,36 @@ def adjust_and_report(
         tell = None if quiet else lambda text: typer.echo(text, err=True)
         found, network = estimate_components(network, components, options, tell=tell, **settings)
         settings = {**settings, "image_sigma": None}
-    strategy = None
+    strategy = audited = None
     chosen = Plan(**(plan or {}))
-    if chosen.empty:
-        result = adjust_network(network, **settings, progress=None if quiet else progress)
+    if audit:
+        from baarda.procedures.audit import audit as audit_network
+
+        if not chosen.empty or components is not None:
+            raise UsageError("--audit evaluates a solution as it stands: no procedure that changes the model goes with it")
+        audited = audit_network(network, options, **settings, progress=None if quiet else progress)
+        result = audited.adjustment
+    elif chosen.empty:
+        tell = None if quiet else lambda text: typer.echo(text, err=True)
+        result = adjust_network(network, **settings, progress=None if quiet else progress, tell=tell)
     else:
         result, strategy = carry_out(network, chosen, options, None if quiet else lambda text: typer.echo(text, err=True), **settings)
     if not quiet:
         typer.echo("testing and writing ...", err=True)
-    analysis = replace(analyse(result, options), strategy=strategy, components=found)
+    analysis = replace(analyse(result, options), strategy=strategy, components=found, audit=audited)
     if result.status == "converged" and points is not None:
         geojson.write_points(result, points, options.sigma)
     if result.status == "converged" and covariance is not None:
         covariance_file.write_covariance(result, covariance, sigma=options.sigma)
     if out is not None:
-        write_folder(analysis, out, tables, {"seconds": round(time.perf_counter() - started, 3)})
+        write_folder(analysis, out, tables, {"seconds": round(time.perf_counter() - started, 3)}, spoken, pdf)
     if as_json:
         typer.echo(json.dumps(result_json(analysis), indent=1, allow_nan=False, ensure_ascii=False))
         sys.stdout.flush()
     elif not quiet:
-        for sentence in page.verdict(analysis):
-            typer.echo(sentence)
+        with language(spoken):
+            for sentence in page.verdict(analysis):
+                typer.echo(sentence)
     if out is not None and not quiet:
         typer.echo(f"report: {out / 'report.html'}", err=True)
     if not analysis.converged:

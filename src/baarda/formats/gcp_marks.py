@@ -83,8 +83,8 @@ def with_marks(
     Returns
     -------
     Network
-        A control point whose label another point bears is called ``GCP label``; without surveyed coordinates it is a tie point. Where
-        they are missing, start values are intersected.
+        A control point whose label another point bears is called ``GCP label``; without surveyed coordinates it is a tie point. Tie and
+        check points start where their rays meet, else where they were surveyed.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def with_marks(
     enters = known & (role == CONTROL)[:, None]
     fresh = Points.make(
         labels,
-        np.where(enters, given, start),
+        np.where(enters | np.isnan(start), given, start),
         role,
         np.where(enters, OBSERVED, FREE),
         given,

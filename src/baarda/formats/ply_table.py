@@ -74,6 +74,8 @@ def vertices(data: bytes, file: Path, needed: tuple[str, ...]) -> dict[str, NDAr
     names = [n for n, _ in fields]
     if not order or count < 0 or len(set(names)) < len(names):
         raise InputError("the PLY header has no format, no vertices, or a property twice", file)
+    if dict(fields).get("id", "i4").lstrip("<>")[0] == "f":
+        raise InputError("the property id must be whole numbers", file)
     missing = [n for n in needed if n not in names]
     if missing:
         raise InputError(f"the vertices have no property {missing[0]!r}; they have {', '.join(names)}", file)
@@ -91,4 +93,5 @@ def vertices(data: bytes, file: Path, needed: tuple[str, ...]) -> dict[str, NDAr
         if len(body) < count * dtype.itemsize:
             raise InputError(f"{count} vertices of {dtype.itemsize} bytes are announced, {len(body)} bytes follow: truncated?", file)
         table = np.frombuffer(body, dtype, count)
-    return {n: table[n] for n in names}
+    with np.errstate(invalid="ignore"):  # a NaN that signals
+        return {n: table[n].astype(float) if table[n].dtype.kind == "f" else table[n] for n in names}

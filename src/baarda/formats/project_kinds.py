@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from baarda.cameras import FIXED, FREE, STATES
+from baarda.cameras import FREE, OBSERVED, STATES
 from baarda.errors import InputError, UsageError
 from baarda.formats.base import label_problem
 from baarda.formats.checks import correlations, sigma_range
 from baarda.formats.csv_table import CsvTable, numbers_text, quoted
+from baarda.formats.vector_tables import VECTOR_TABLES, VectorTable
 from baarda.network import AXES, Declared, Images, Network, Points
-from baarda.observations import Angles, CameraPositions, Directions, HeightDifferences, LeverArms, Stations, Strips
+from baarda.observations import Angles, CameraPositions, Directions, HeightDifferences, LeverArms, Stations, Strips, Tracks
 
 Floats = NDArray[np.float64]
 Columns = dict[str, list[str]]
@@ -154,20 +155,21 @@ class PositionTable:
         return CameraPositions(image, arm, line, table.numbers("time", None), values, c, unit)
 
 
-KIND_TABLES: dict[str, KindTable | PositionTable] = {
+KIND_TABLES: dict[str, KindTable | PositionTable | VectorTable] = {
     t.kind: t
     for t in (
         PositionTable(),
         KindTable("directions", Directions, {"from": "starts", "to": "ends"}, {"station": ("sets", "station")}, in_units=False),
         KindTable("angles", Angles, {"from": "starts", "back": "backs", "fore": "fores"}, {}, in_units=False),
         KindTable("height_differences", HeightDifferences, {"from": "starts", "to": "ends"}, {}, in_units=True),
+        *VECTOR_TABLES,
     )
 }
-DECLARED: dict[str, type[Declared]] = {"station": Stations, "lever_arm": LeverArms, "strip": Strips}
-DECLARED_COLUMNS = (("kind", "node", "parameter", "value"), ("unit", "state"))
+DECLARED: dict[str, type[Declared]] = {"station": Stations, "lever_arm": LeverArms, "strip": Strips, "track": Tracks}
+DECLARED_COLUMNS = (("kind", "node", "parameter", "value"), ("unit", "state", "given", "sigma"))
 
 
-def kind_table_of(group: Any) -> KindTable | PositionTable:
+def kind_table_of(group: Any) -> KindTable | PositionTable | VectorTable:
     """Return the table of an observation group.
 
     Raises
@@ -189,7 +191,7 @@ def declared_columns(declared: tuple[Declared, ...]) -> Columns:
     UsageError
         If a label cannot be written, or a kind could not be read back.
     """
-    out: Columns = {name: [] for name in ("kind", "node", "parameter", "value", "unit", "state")}
+    out: Columns = {name: [] for name in ("kind", "node", "parameter", "value", "unit", "state", "given", "sigma")}
     for d in declared:
         if d.kind not in DECLARED:
             raise UsageError(f"unknowns of the kind {d.kind!r} cannot be written to a project")
@@ -200,11 +202,11 @@ def declared_columns(declared: tuple[Declared, ...]) -> Columns:
             if problem or not label:
                 raise UsageError(f"{problem or f'a {d.kind} has an empty label'}: it cannot be written")
             for k, name in enumerate(d.parameters[node if len(d.parameters) > 1 else 0]):
-                row = (quoted(d.kind), quoted(label), quoted(name), None, quoted(d.unit_of(node, k)), STATES[d.states[d.offsets[node] + k]])
-                for column, text in zip(out, row, strict=True):
-                    if text is not None:
-                        out[column].append(text)
-        out["value"] += numbers_text(d.values)
+                row = (quoted(d.kind), quoted(label), quoted(name), quoted(d.unit_of(node, k)), STATES[d.states[d.offsets[node] + k]])
+                for column, text in zip(("kind", "node", "parameter", "unit", "state"), row, strict=True):
+                    out[column].append(text)
+        for name, numbers in (("value", d.values), ("given", d.given), ("sigma", d.sigmas)):
+            out[name] += numbers_text(numbers)
     return out
 
 
@@ -218,12 +220,15 @@ def read_declared(table: CsvTable) -> tuple[Declared, ...]:
     """
     kinds, nodes, names = (table.texts(c) for c in ("kind", "node", "parameter"))
     units, said = table.texts("unit", ""), table.choices("state", STATES)
-    values = table.numbers("value", None)
+    values, given, sigmas = table.numbers("value"), table.numbers("given"), table.sigmas("sigma")
     for row, text in enumerate(kinds):
         if text not in DECLARED:
             raise table.error(row, f"unknowns of the kind {text!r} are not known; known are {', '.join(DECLARED)}")
-    states = np.where(said < 0, FREE, said)
-    _refuse(table, ~np.isin(states, (FIXED, FREE)), "a declared unknown must be fixed or free")
+    states = np.where(said < 0, np.where(np.isnan(sigmas), FREE, OBSERVED), said)
+    given = np.where((states == OBSERVED) & np.isnan(given), values, given)
+    needed = np.array([not DECLARED[text].starts_itself for text in kinds], dtype=bool)
+    _refuse(table, np.isnan(values) & needed, "value is missing")
+    _refuse(table, (states == OBSERVED) & ~((sigmas > 0.0) & np.isfinite(given)), "an observed unknown needs a given value and a sigma")
     out = []
     for kind in dict.fromkeys(kinds):
         rows = [r for r, text in enumerate(kinds) if text == kind]
@@ -241,7 +246,8 @@ def read_declared(table: CsvTable) -> tuple[Declared, ...]:
         if len(set(parameters)) == 1 and len(set(unit)) == 1:
             parameters, unit = parameters[:1], unit[:1]
         try:
-            out.append(DECLARED[kind](kind, tuple(groups), parameters, unit, values[rows], states[rows].astype(np.int8)))
+            known = (values[rows], states[rows].astype(np.int8), given[rows], sigmas[rows])
+            out.append(DECLARED[kind](kind, tuple(groups), parameters, unit, *known))
         except UsageError as error:
             raise InputError(str(error), table.file) from None
     return tuple(out)

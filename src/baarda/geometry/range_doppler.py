@@ -279,7 +279,7 @@ def intersect_ranges(position: Floats, velocity: Floats, squint: Floats, distanc
         size = float(np.linalg.norm(step))
         x = x + step
         if size <= 1e-14 * float(length.max()) or (size >= 0.5 * last and size <= 1e-7 * float(length.max())):
-            return x
+            return np.asarray(x, dtype=float)
         last = size
     raise Singular("the ranges do not determine the point (tracks that see it from the same direction, or a start on the wrong side)")
 
@@ -346,7 +346,7 @@ def flight_from_control(points: ArrayLike, s: ArrayLike, r: ArrayLike, delay: fl
         raise Singular("the control points lie on one line in plan: they do not determine the flight")
     (gx, gy, first), *_ = np.linalg.lstsq(np.column_stack([d[:, :2], np.ones(len(d))]), t, rcond=None)
     slope = float(np.hypot(gx, gy))
-    if slope * spread[0] <= 1e-6 * float(np.ptp(t)) or slope == 0.0:
+    if slope * spread[0] <= 1e-9 * float(np.abs(t).max()):
         raise Singular("time does not grow along the control points: they do not determine the flight")
     forward = np.array([gx, gy]) / slope
     across = np.array([-forward[1], forward[0]])  # to the left
@@ -375,9 +375,9 @@ def _across(pixel: Floats, y: Floats, z: Floats, delay: float, height: float) ->
 
     def fit(m: float) -> tuple[Floats, Floats, Floats]:
         right = y**2 + z**2 - 2.0 * height * z - (m * pixel + delay) ** 2
-        solved = np.linalg.lstsq(a, right, rcond=None)[0]
+        solved = np.asarray(np.linalg.lstsq(a, right, rcond=None)[0], dtype=float)
         slope = -2.0 * (m * pixel + delay) * pixel
-        return solved, right - a @ solved, slope - a @ np.linalg.lstsq(a, slope, rcond=None)[0]
+        return solved, right - a @ solved, np.asarray(slope - a @ np.linalg.lstsq(a, slope, rcond=None)[0], dtype=float)
 
     # the misfit has several minima in m: search over six decades, then refine
     size = max(float(np.ptp(y)), 1.0) / float(np.abs(pixel).max())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -14,10 +15,12 @@ from baarda.hypotheses._estimates import Judged, joined, judged, not_applicable
 from baarda.hypotheses._laws import check_redundancy, check_variance, f_law, f_name, member_laws, number, range_name, same
 from baarda.hypotheses._quadratic import quadratic_form, ranked_form, variances, vector_and_matrix
 from baarda.hypotheses.base import Evidence, Floats, Law, TestResult
+from baarda.hypotheses.deformation import pooled_variance_factor
 from baarda.hypotheses.levels import Options, Policy, family_result
 from baarda.hypotheses.parameters import general_linear
+from baarda.hypotheses.variance_factor import variance_ratio
 
-__all__ = ["equal_groups", "equal_parameters", "grouped_parameters"]
+__all__ = ["equal_groups", "equal_parameters", "equal_parameters_of_epochs", "grouped_parameters"]
 
 ORDER = 52
 MOST_PAIRS = 10  # cameras of which every pair is tested
@@ -156,6 +159,74 @@ def equal_parameters(
         raise UsageError(f"the cofactors between the two have shape {c.shape}, not {qa.shape}")
     null = "Both have the same parameters."
     return general_linear(a - b, qa + qb - c - c.T, variance_factor, redundancy, None, alpha, names=names, name=name, null=null)
+
+
+def equal_parameters_of_epochs(
+    first: ArrayLike,
+    cofactors_first: ArrayLike,
+    factor_first: float,
+    redundancy_first: float,
+    second: ArrayLike,
+    cofactors_second: ArrayLike,
+    factor_second: float,
+    redundancy_second: float,
+    alpha: float = 0.05,
+    names: Sequence[str] = (),
+    name: str = "equal_epochs",
+) -> TestResult:
+    """Test whether parameters are equal in two independent adjustments, after the test whether these are equally precise.
+
+    Parameters
+    ----------
+    first, second : (k,) array
+        Estimates of the same parameters.
+    cofactors_first, cofactors_second : (k, k) array
+    factor_first, factor_second : float
+        Variance factors.
+    redundancy_first, redundancy_second : float
+    alpha : float
+        Level of both tests.
+    names : sequence of str
+        Names of the parameters.
+    name : str
+        Name of the result.
+
+    Returns
+    -------
+    TestResult
+        Under F(k, r1 + r2) with the pooled variance factor where the variance ratio does not reject; else each epoch by its own factor
+        under F(k, the smaller r), which is approximate. The note and ``details["variance_ratio"]`` tell which.
+
+    Raises
+    ------
+    UsageError, Singular, RedundancyNotPositive
+        As `equal_parameters` and `variance_ratio`.
+
+    Notes
+    -----
+    Grün (1978) p. 399: pooling presumes equal variance factors.
+
+    Examples
+    --------
+    >>> q = [[0.1, 0.0], [0.0, 0.1]]
+    >>> t = equal_parameters_of_epochs([1.0, 2.0], q, 1.0, 30, [1.2, 1.5], q, 1.1, 20)
+    >>> t.statistic, t.df
+    (0.697, (2.0, 50.0))
+    >>> equal_parameters_of_epochs([1.0, 2.0], q, 1.0, 30, [1.2, 1.5], q, 9.0, 20).df
+    (2.0, 20.0)
+    """
+    ratio = variance_ratio(factor_first, redundancy_first, factor_second, redundancy_second, alpha)
+    q1, q2 = np.asarray(cofactors_first, dtype=float), np.asarray(cofactors_second, dtype=float)
+    if ratio.rejected:
+        factor, r = 1.0, float(min(redundancy_first, redundancy_second))
+        q1, q2 = factor_first * q1, factor_second * q2
+        told = "The variance factors differ: each epoch is judged by its own, with the smaller redundancy; the law is then approximate."
+    else:
+        factor, r = pooled_variance_factor(factor_first, redundancy_first, factor_second, redundancy_second)
+        told = "The variance factors do not differ: both are pooled."
+    t = equal_parameters(first, q1, second, q2, factor, r, None, alpha, names, name)
+    judged_by = {"statistic": ratio.statistic, "p_value": ratio.p_value, "rejected": bool(ratio.rejected)}
+    return replace(t, note=joined(told, t.note), details={**t.details, "variance_ratio": judged_by})
 
 
 def equal_groups(

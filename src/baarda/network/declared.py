@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +55,9 @@ class Declared:
     units: tuple[tuple[str, ...], ...]
     values: Floats
     states: States
+    #: Whether a missing value (NaN) is one that the observation kind finds a start for.
+    starts_itself: ClassVar[bool] = False
+
     given: Floats = field(default_factory=lambda: np.zeros(0))
     sigmas: Floats = field(default_factory=lambda: np.zeros(0))
 

@@ -273,7 +273,8 @@ class State:
 def along_rays(points: Floats, steps: Floats, centres: Floats | None) -> Floats:
     """Return the steps (n, 3) of points with their part along the ray from a centre taken in inverse distance.
 
-    With s the step along the ray over the distance, the distance is divided by 1 - s; beyond s = 1/2 the distance goes on in proportion.
+    With s the step along the ray over the distance, the distance is divided by 1 - s; beyond s = 1/2 it goes on in proportion. Steps
+    with |s| below 0.1 are left as they are, so that sums of small steps keep the conditions of a datum.
 
     Examples
     --------
@@ -285,6 +286,6 @@ def along_rays(points: Floats, steps: Floats, centres: Floats | None) -> Floats:
     ray = points - centres
     with np.errstate(divide="ignore", invalid="ignore"):
         s = np.einsum("ni,ni->n", steps, ray) / np.einsum("ni,ni->n", ray, ray)
-    s = np.where(np.isfinite(s), s, 0.0)
+    s = np.where(np.abs(s) > 0.1, s, 0.0)  # false for NaN
     factor = np.where(s < 0.5, s / (1.0 - np.minimum(s, 0.5)), 4.0 * s - 1.0)
     return np.asarray(steps + (factor - s)[:, None] * np.where(np.isfinite(ray), ray, 0.0))

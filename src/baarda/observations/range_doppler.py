@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +81,8 @@ class Tracks(Declared):
 
     `side` is where the antenna looks: 1 left, -1 right, 0 not known. A value that is NaN is found from control points.
     """
+
+    starts_itself: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

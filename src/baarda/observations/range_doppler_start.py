@@ -43,7 +43,7 @@ def with_start(group: RangeDoppler, network: Network, aside: NDArray[np.bool_]) 
     """
     network = _tracks(group, network)
     tracks = _group(network)
-    s, known = _times(group, network), np.isfinite(network.points.coordinates).all(axis=1)
+    s, known = _times(group, network), np.asarray(np.isfinite(network.points.coordinates).all(axis=1))
     sides = np.array([_value(tracks, i, "side") for i in range(len(tracks.labels))])
     for i, label in enumerate(tracks.labels):
         rows = np.flatnonzero((group.tracks == i) & known[group.points] & (network.points.roles[group.points] == CONTROL))
@@ -54,7 +54,7 @@ def with_start(group: RangeDoppler, network: Network, aside: NDArray[np.bool_]) 
                 name = network.points.labels[group.points[rows[wrong[0]]]]
                 there, here = SIDES[int(seen[wrong[0]])], SIDES[int(sides[i])]
                 raise UsageError(f"control point {name} lies {there} of track {label}, which looks {here}")
-        elif len(seen) and (seen == seen[0]).all():
+        elif len(seen) and np.ptp(seen) == 0:
             sides[i] = seen[0]  # control shows it
     missing = np.unique(group.points[~known[group.points] & ~aside[group.points]])
     if not len(missing):
@@ -93,7 +93,7 @@ def _side_of(tracks: Tracks, node: int, s: Floats, points: Floats) -> NDArray[np
     """Return 1 for points to the left of the flight, -1 for those to the right."""
     a = _antenna(tracks, node, s)
     d = points - a.position
-    return np.where(a.velocity[:, 0] * d[:, 1] - a.velocity[:, 1] * d[:, 0] > 0.0, 1, -1)
+    return np.asarray(np.where(a.velocity[:, 0] * d[:, 1] - a.velocity[:, 1] * d[:, 0] > 0.0, 1, -1), dtype=np.intp)
 
 
 def _tracks(group: RangeDoppler, network: Network) -> Network:

@@ -15,7 +15,8 @@ from baarda.errors import UsageError
 from baarda.geometry import rotation as rot
 from baarda.hypotheses.base import Evidence, TestResult
 from baarda.hypotheses.levels import Options
-from baarda.hypotheses.outliers import tau
+from baarda.hypotheses.outliers import from_evidence as test_observations
+from baarda.hypotheses.variance_factor import from_evidence as test_variance_factor
 from baarda.network import EXTERIOR, Network, State, Table
 from baarda.observations import ImagePoints
 
@@ -77,7 +78,8 @@ class Audit:
         """Root mean square of the image residuals, pixels per coordinate: as it stands, and at the minimum."""
         a = self.adjustment
         rows = np.concatenate([np.full(len(g) * len(g.components), isinstance(g, ImagePoints)) for g in a.groups])
-        return tuple(float(np.sqrt(np.mean(v[rows] ** 2))) if rows.any() else float("nan") for v in (self.residuals, a.residuals))  # type: ignore[return-value]
+        stands, least = (float(np.sqrt(np.mean(v[rows] ** 2))) if rows.any() else float("nan") for v in (self.residuals, a.residuals))
+        return stands, least
 
     @cached_property
     def differences(self) -> Table:
@@ -93,14 +95,21 @@ class Audit:
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.where(sigma > 0.0, d / sigma, np.nan)
         return Table(
-            {"name": np.array(a.numbering.names, dtype=object), "group": kinds, "unit": unit, "difference": d, "sigma": sigma, "ratio": ratio}
+            {
+                "name": np.array(a.numbering.names, dtype=object),
+                "group": kinds,
+                "unit": unit,
+                "difference": d,
+                "sigma": sigma,
+                "ratio": ratio,
+            }
         )
 
     @cached_property
     def conditional_share(self) -> tuple[float, float] | None:
         """How much of the true sigma of the object points a program shows that holds the cameras fixed: median and least share.
 
-        None without points that are unknown in all coordinates.
+        None without points that are unknown in all coordinates, and with combined observation equations.
         """
         a = self.adjustment
         columns = a.numbering["point"].columns.reshape(-1, 3)
@@ -112,7 +121,10 @@ class Audit:
         normal = np.zeros((len(columns), 3, 3))
         for group in a.groups:
             for rows in group.linearize(network, state):
-                weight = np.linalg.inv(rows.cofactor)
+                if rows.condition is not None:
+                    return None  # fewer conditions than observations: the point has no block of its own rows
+                cofactor = rows.cofactor
+                weight = np.eye(cofactor.shape[1]) / cofactor[:, None, :] if cofactor.ndim == 2 else np.linalg.inv(cofactor)
                 for block in rows.blocks:
                     if block.kind == "point":
                         np.add.at(normal, block.nodes, np.swapaxes(block.jacobian, 1, 2) @ weight @ block.jacobian)
@@ -147,7 +159,8 @@ class Audit:
             "not_in_the_solution": list(self.unknown),
             "conditional_share": None if share is None else {"median": share[0], "least": share[1]},
             "groups": [
-                {"group": name, "unknowns": count, "rms": rms, "largest": largest, "at": at} for name, count, rms, largest, at in self.by_group()
+                {"group": name, "unknowns": count, "rms": rms, "largest": largest, "at": at}
+                for name, count, rms, largest, at in self.by_group()
             ],
             "tests": [
                 {"name": t.name, "rejected": int(np.sum(t.rejected)), "of": int(np.size(t.rejected)), "level": t.alpha} for t in self.tests
@@ -208,12 +221,7 @@ def _as_it_stands(result: Adjustment, residuals: Floats, objective: float) -> Ev
 
 
 def _tests(evidence: Evidence, options: Options) -> tuple[TestResult, ...]:
-    from baarda.hypotheses import outliers, variance_factor
-
-    found: list[TestResult] = []
-    for member in (variance_factor, outliers):
-        out = member.from_evidence(evidence, options)
-        found += list(out) if isinstance(out, (list, tuple)) else [out] if out is not None else []
+    found = [*test_variance_factor(evidence, options), *test_observations(evidence, options)]
     return tuple(t for t in found if t.name in TESTED)
 
 
@@ -232,7 +240,9 @@ def _difference(a: Adjustment) -> Floats:
     out = np.zeros(a.numbering.count + 1)
     turn = rot.log(new.images.rotation @ old.images.rotation.transpose(0, 2, 1)) if len(new.images.labels) else np.zeros((0, 3))
     values = {
-        "camera": np.concatenate([c.values - b.values for c, b in zip(new.cameras, old.cameras, strict=True)]) if new.cameras else np.zeros(0),
+        "camera": np.concatenate([c.values - b.values for c, b in zip(new.cameras, old.cameras, strict=True)])
+        if new.cameras
+        else np.zeros(0),
         "image": np.concatenate([new.images.position - old.images.position, turn], axis=1).reshape(-1, len(EXTERIOR)).ravel(),
         "point": (new.points.coordinates - old.points.coordinates).ravel(),
         **{d.kind: d.values - b.values for d, b in zip(new.declared, old.declared, strict=True)},

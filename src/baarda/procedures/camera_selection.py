@@ -1,4 +1,4 @@
-"""Selection of the additional camera parameters of a network, each step a rigorous adjustment."""
+"""Selection of additional camera parameters and of removable declared ones, each step a rigorous adjustment."""
 
 from __future__ import annotations
 
@@ -54,7 +54,9 @@ def check_rms(network: Network, aside: NDArray[np.bool_]) -> float | None:
 
 
 class CameraModel:
-    """A network as a model whose additional camera parameters may be deleted; see `baarda.procedures.selection.Model`.
+    """A network as a model whose additional parameters may be deleted; see `baarda.procedures.selection.Model`.
+
+    They are the additional parameters of the cameras and what declared groups call `removable`.
 
     Parameters
     ----------
@@ -77,6 +79,14 @@ class CameraModel:
             for k, name in enumerate(c.model.order):
                 if c.model.additional[k] and c.states[k] != FIXED and i in used:
                     self.places[f"camera {c.label}: {name}"] = (i, k)
+        self.declared: dict[str, tuple[int, int]] = {}
+        numbering = unknowns_of(network)
+        for i, d in enumerate(network.declared):
+            removable, columns = d.removable(), numbering[d.kind].columns
+            for node, label in enumerate(d.labels):
+                for k, name in enumerate(d.parameters_of(node), int(d.offsets[node])):
+                    if removable[k] and columns[k] >= 0:
+                        self.declared[f"{d.kind} {label}: {name}"] = (i, k)
 
     def fit(self, deleted: frozenset[str]) -> Fit:
         """Adjust with these parameters fixed at zero."""
@@ -87,8 +97,10 @@ class CameraModel:
             gone = f" without {', '.join(sorted(deleted))}" if deleted else ""
             raise UsageError(f"the adjustment{gone} did not converge: parameters cannot be selected; {a.contradictions()}")
         self.warm = a
-        e = a._camera_estimates(additional_only=True)
-        at = [i for i, name in enumerate(e.names) if name in self.places]
+        names = tuple(name for name in (*self.places, *self.declared) if name not in deleted)
+        columns = np.array([a.numbering.column(name) for name in names], dtype=np.intp)
+        values = np.array([self._value(a.network, name) for name in names])
+        q = a.cofactors.of(columns) if len(columns) else np.zeros((0, 0))
         omega, extra = self._priors(deleted)
         redundancy = a.redundancy + extra
         trace = a.variance_factor * float(np.einsum("nii->", a.point_cofactors)) if self.with_trace else None
@@ -96,8 +108,24 @@ class CameraModel:
         fitted = Fitted(a.objective + omega, a.count + extra, redundancy, trace, check_rms(a.network, a.aside))
         with threadpool_limits(limits=1, user_api="blas"):
             entering = self._entering(a, deleted, fitted)
-        names = tuple(e.names[i] for i in at)
-        return Fit(names, e.values[at], e.cofactors[np.ix_(at, at)], a.numbering.count, fitted, entering, a)
+        return Fit(names, values, 0.5 * (q + q.T), a.numbering.count, fitted, entering, a)
+
+    def _value(self, network: Network, name: str) -> float:
+        if name in self.places:
+            i, k = self.places[name]
+            return float(network.cameras[i].values[k])
+        i, k = self.declared[name]
+        return float(network.declared[i].values[k])
+
+    def _prior(self, name: str) -> tuple[float, float] | None:
+        """Return the a-priori value and sigma of a parameter; None if it has none."""
+        if name in self.places:
+            i, k = self.places[name]
+            c = self.base.cameras[i]
+            return (float(c.prior[k]), float(c.sigmas[k])) if c.states[k] == OBSERVED else None
+        i, k = self.declared[name]
+        d = self.base.declared[i]
+        return (float(d.given[k]), float(d.sigmas[k])) if d.states[k] == OBSERVED else None
 
     def _network(self, deleted: frozenset[str], warm: Network | None = None) -> Network:
         """Return the network with these parameters fixed at zero, at the values found last."""
@@ -105,21 +133,28 @@ class CameraModel:
         cameras = list(source.cameras)
         for i, c in enumerate(self.base.cameras):
             states, values = np.array(c.states), np.array(cameras[i].values)
-            for name in deleted:
+            for name in deleted & self.places.keys():
                 j, k = self.places[name]
                 if j == i:
                     states[k], values[k] = FIXED, 0.0
             cameras[i] = replace(cameras[i], states=states, values=values)
-        return replace(source, cameras=tuple(cameras))
+        declared = list(source.declared)
+        for i, d in enumerate(self.base.declared):
+            states, values = np.array(d.states), np.array(declared[i].values)
+            for name in deleted & self.declared.keys():
+                j, k = self.declared[name]
+                if j == i:
+                    states[k], values[k] = FIXED, 0.0
+            declared[i] = replace(declared[i], states=states, values=values)
+        return replace(source, cameras=tuple(cameras), declared=tuple(declared))
 
     def _priors(self, deleted: frozenset[str]) -> tuple[float, int]:
         """Return v'Pv and number of the a-priori values of deleted parameters."""
         omega, count = 0.0, 0
         for name in sorted(deleted):
-            i, k = self.places[name]
-            c = self.base.cameras[i]
-            if c.states[k] == OBSERVED:
-                omega += float((c.prior[k] / c.sigmas[k]) ** 2)
+            prior = self._prior(name)
+            if prior is not None:
+                omega += (prior[0] / prior[1]) ** 2
                 count += 1
         return omega, count
 
@@ -140,11 +175,10 @@ class CameraModel:
         pull = columns.T @ a.lin.misclosure
         out = {}
         for j, name in enumerate(names):
-            i, k = self.places[name]
-            c = self.base.cameras[i]
+            prior = self._prior(name)
             weight = pulled = 0.0
-            if c.states[k] == OBSERVED:
-                weight, pulled = float(c.sigmas[k] ** -2), float(c.prior[k] / c.sigmas[k] ** 2)
+            if prior is not None:
+                weight, pulled = prior[1] ** -2, prior[0] / prior[1] ** 2
             determined = float(share[j]) > 1e-12 * float(columns[:, j] @ columns[:, j])
             if determined or weight:
                 gain = (float(pull[j]) + pulled) ** 2 / (float(share[j]) + weight)
@@ -162,7 +196,7 @@ def selection_options(options: Options, **more: Any) -> SelectionOptions:
 def select_parameters(
     network: Network, options: SelectionOptions | None = None, tell: Told | None = None, **settings: Any
 ) -> tuple[Selection, Adjustment]:
-    """Drop the insignificant additional parameters of all cameras, one by one, and adjust again each time.
+    """Drop the insignificant additional parameters of cameras and declared groups, one by one, and adjust again each time.
 
     Parameters
     ----------

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from baarda.adjustment import Adjustment, adjust
 from baarda.adjustment.datum import FREEDOMS
-from baarda.errors import UsageError
+from baarda.errors import Singular, UsageError
 from baarda.geometry.rotation import skew
 from baarda.geometry.similarity import Similarity, similarity
 from baarda.hypotheses.base import TestResult
 from baarda.hypotheses.deformation import Localisation, deformation, deformation_point, moved_points, pooled_variance_factor
 from baarda.hypotheses.levels import Options
 from baarda.hypotheses.variance_factor import variance_ratio
-from baarda.network import CHECK, CONTROL, Network, State
+from baarda.network import AXES, CHECK, CONTROL, Network, State
 from baarda.observations import ImagePoints
 from baarda.procedures.planning import plan
 
@@ -83,7 +83,7 @@ class Comparison:
     labels : tuple of str
         Points compared.
     differences : (k, 3) array
-        In the common datum, tied to the stable points.
+        In the common datum, tied to the stable points; NaN where a coordinate is fixed in one of the two.
     sigmas : (k, 3) array
         Standard deviations of these differences.
     coordinates : (k, 3) array
@@ -190,7 +190,8 @@ def compare(
         Compare the coordinates as they are given, or after taking out what the datum leaves free (shifts, rotations, scale); auto takes out
         what at least one of the two leaves free.
     points : sequence of str, optional
-        Points to compare; by default all that both have and that are not fixed, at most 400.
+        Points to compare; by default all of which both determine a coordinate, at most 400. Coordinates that are fixed in one of the two
+        are not compared; where a whole similarity transformation is taken out, points with such coordinates are left out.
 
     Returns
     -------
@@ -200,6 +201,8 @@ def compare(
     ------
     UsageError
         If units differ, or too few points are common.
+    Singular
+        If the cofactors of the differences are not those of an adjustment.
 
     Notes
     -----
@@ -223,10 +226,10 @@ def compare(
         raise UsageError(f"the frame is 'auto', 'given' or 'common', not {frame!r}")
     if first.network.unit != second.network.unit:
         raise UsageError(f"the object units differ: {first.network.unit} and {second.network.unit}")
-    labels, rows = _common(first, second, points, notes)
+    freedoms = _freedoms(first, second, frame)
+    labels, rows, used = _common(first, second, points, len(freedoms) >= 6, notes)
     x1, x2 = first.coordinates(rows[0]), second.coordinates(rows[1])
     q1, q2 = first.cofactors(rows[0]), second.cofactors(rows[1])
-    freedoms = _freedoms(first, second, frame, len(labels))
     transformation = None
     if len(freedoms) >= 6:
         transformation = similarity(x2, x1, with_scale="scale" in freedoms)
@@ -234,33 +237,35 @@ def compare(
         x2, q2 = transformation.apply(x2), turn @ q2 @ turn.T
     dependent = _share_of_equal(first, second) > _SAME
     ratio, factor, r, weights = _factors(first, second, o, dependent, notes)
-    d, q = (x2 - x1).ravel(), weights[0] * q1 + weights[1] * q2
+    at = np.flatnonzero(used)
+    d, q = (x2 - x1).ravel()[at], (weights[0] * q1 + weights[1] * q2)[np.ix_(at, at)]
     if dependent:
-        q = np.asarray(q1)  # what the differences are measured with
-    everywhere = np.ones(len(labels), dtype=bool)
-    g = _directions(x1, freedoms)
-    reduced, cofactors = _transformed(d, q, g, everywhere)
+        q = np.asarray(q1)[np.ix_(at, at)]  # what the differences are measured with
+    point = at // 3
+    g = _independent(_directions(x1, freedoms)[at])
+    reduced, cofactors = _transformed(d, q, g, np.ones(len(at), dtype=bool))
     congruence = family = localisation = None
     if not dependent:
         defect = g.shape[1]
-        each = [label for label in labels for _ in range(3)]
+        each = [labels[i] for i in point]
         congruence = deformation(reduced, cofactors, factor, r, o.global_level(len(d) - defect), defect)
         family = deformation_point(reduced, cofactors, factor, r, each, o.global_level(3), o.levels, defect)
         if congruence.rejected:
             localisation = moved_points(reduced, cofactors, factor, r, each, o.global_level(3), defect)
             stable = np.isin(labels, localisation.stable)
-            if 3 * stable.sum() > defect and stable.sum() >= 3:
-                reduced, cofactors = _transformed(d, q, g, stable)
+            if stable[point].sum() > defect and stable.sum() >= 3:
+                reduced, cofactors = _transformed(d, q, g, stable[point])
             if not localisation.decided:
                 notes.append("Too few points are left to tell the stable from the moved ones: most of them differ.")
         notes += _control_notes(first, second, freedoms)
-    deviation = np.sqrt(np.maximum(factor * np.diag(cofactors), 0.0)).reshape(-1, 3)
+    differences, deviations = np.full((2, len(labels), 3), np.nan)
+    differences.ravel()[at], deviations.ravel()[at] = reduced, np.sqrt(factor * _variances(cofactors, q))
     return Comparison(
         first,
         second,
         labels,
-        reduced.reshape(-1, 3),
-        deviation,
+        differences,
+        deviations,
         x1,
         freedoms,
         transformation,
@@ -276,13 +281,23 @@ def compare(
     )
 
 
-def _common(first: Epoch, second: Epoch, points: Sequence[str] | None, notes: list[str]) -> tuple[tuple[str, ...], tuple[Ints, Ints]]:
-    """Return the labels of the points to compare and their rows in both networks."""
-    places = []
-    for e in (first, second):
-        free = np.asarray((e.adjustment.numbering["point"].columns.reshape(-1, 3) >= 0).all(axis=1))
-        places.append({label: i for i, label in enumerate(e.network.points.labels) if free[i]})
-    known = [label for label in places[0] if label in places[1]]
+def _variances(cofactors: Floats, of: Floats) -> Floats:
+    """Return the diagonal of transformed cofactors; what rounding leaves below zero is zero, more is an error."""
+    own, rounding = np.diag(cofactors), 1e-9 * np.diag(of).max(initial=0.0)
+    if (own < -rounding).any():
+        raise Singular("the cofactors of the differences have a negative variance")
+    return np.asarray(np.where(own > 0.0, own, 0.0))
+
+
+def _common(
+    first: Epoch, second: Epoch, points: Sequence[str] | None, whole: bool, notes: list[str]
+) -> tuple[tuple[str, ...], tuple[Ints, Ints], NDArray[np.bool_]]:
+    """Return the labels of the points to compare, their rows in both networks, and which coordinates (k, 3) both determine."""
+    free = [e.adjustment.numbering["point"].columns.reshape(-1, 3) >= 0 for e in (first, second)]
+    every = [{label: i for i, label in enumerate(e.network.points.labels)} for e in (first, second)]
+    shared = {p: free[0][every[0][p]] & free[1][every[1][p]] for p in every[0] if p in every[1]}
+    known = [p for p, used in shared.items() if (used.all() if whole else used.any())]
+    places = [{p: place[p] for p in known} for place in every]
     if points is not None:
         missing = [p for p in points if p not in set(known)]
         if missing:
@@ -300,10 +315,14 @@ def _common(first: Epoch, second: Epoch, points: Sequence[str] | None, notes: li
         notes.append(f"{len(known)} points are common; {len(chosen)} of them are compared, control and check points first.")
         known = [p for p in known if p in chosen]
     rows = tuple(np.array([place[p] for p in known], dtype=np.intp) for place in places)
-    return tuple(known), (rows[0], rows[1])
+    used = np.array([shared[p] for p in known])
+    if not used.all():
+        told = ", ".join(f"{int(n)} {axis}" for n, axis in zip((~used).sum(axis=0), AXES, strict=True) if n)
+        notes.append(f"Coordinates that are fixed in one of the two are not compared: {told}.")
+    return tuple(known), (rows[0], rows[1]), used
 
 
-def _freedoms(first: Epoch, second: Epoch, frame: Frame, count: int) -> tuple[str, ...]:
+def _freedoms(first: Epoch, second: Epoch, frame: Frame) -> tuple[str, ...]:
     """Return the transformations to take out."""
     defects = [e.adjustment.datum.defect for e in (first, second)]
     if frame == "given":
@@ -328,11 +347,19 @@ def _directions(x: Floats, freedoms: Sequence[str]) -> Floats:
     return np.asarray(every[:, [FREEDOMS.index(f) for f in freedoms]])
 
 
+def _independent(g: Floats) -> Floats:
+    """Return the directions that the compared coordinates show, orthonormal: a network in the plane has no shift in Z."""
+    if not g.shape[1]:
+        return g
+    left, size, _ = np.linalg.svd(g, full_matrices=False)
+    return np.asarray(left[:, size > 1e-9 * size[0]])
+
+
 def _transformed(d: Floats, q: Floats, g: Floats, datum: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Apply the S-transformation S = I - G (G'E G)^-1 G'E to differences and cofactors; E selects the datum points (Baarda 1973)."""
+    """Apply the S-transformation S = I - G (G'E G)^-1 G'E to differences and cofactors; E selects the datum's coordinates (Baarda 1973)."""
     if not g.shape[1]:
         return d, q
-    on = g * np.repeat(datum, 3)[:, None]
+    on = g * datum[:, None]
     s = np.eye(len(d)) - g @ np.linalg.solve(on.T @ g, on.T)
     moved = s @ q @ s.T
     return s @ d, 0.5 * (moved + moved.T)
@@ -359,11 +386,13 @@ def _factors(
 
 
 def _share_of_equal(first: Epoch, second: Epoch) -> float:
-    """Return the share of image points with equal coordinates in both."""
+    """Return the share of image points with equal coordinates in both; of all other observed values where there are no image points."""
     pixels = [
         np.concatenate([g.xy for g in e.observations if isinstance(g, ImagePoints)] or [np.zeros((0, 2))]).view(complex).ravel()
         for e in (first, second)
     ]
+    if not any(len(p) for p in pixels):
+        pixels = [np.concatenate([np.zeros(0), *(np.ravel(g.observed()) for g in e.observations)]) for e in (first, second)]
     fewer, more = sorted(pixels, key=len)
     return float(np.isin(fewer, more).mean()) if len(fewer) else 0.0
 

@@ -15,7 +15,8 @@ from baarda.cameras import FREE
 from baarda.errors import BaardaError, UsageError
 from baarda.hypotheses.base import Estimates
 from baarda.hypotheses.levels import Options
-from baarda.network import CHECK, CONTROL, Network
+from baarda.network import AXES, CHECK, CONTROL, Network
+from baarda.observations import RangeDoppler
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -198,8 +199,9 @@ def cross_validate(
 
     Notes
     -----
-    Wu, Liu & Lin (2000). The turns share observations, and differences of one turn are correlated: intervals and p-values of the mean
-    squares use the covariance of the differences within each turn (Satterthwaite's degrees of freedom) and take turns as independent.
+    Wu, Liu & Lin (2000). A point that a single radar track sees is withheld in plan and keeps its height, as there. The turns share
+    observations, and differences of one turn are correlated: intervals and p-values of the mean squares use the covariance of the
+    differences within each turn (Satterthwaite's degrees of freedom) and take turns as independent.
     """
     o = Options() if options is None else options
     table = network.points
@@ -208,6 +210,7 @@ def cross_validate(
         for end in group.points_of():
             rays += np.bincount(end, minlength=len(rays))
     control = np.flatnonzero((table.roles == CONTROL) & (rays > 0) & np.isfinite(table.given).any(axis=1))
+    plan = _plan_only(network)
     parts = folds_of(len(control), folds, o.seed)
     turns: list[Fold] = []
     rows: list[Withheld] = []
@@ -216,7 +219,7 @@ def cross_validate(
         out = control[part]
         labels = tuple(table.labels[i] for i in out)
         try:
-            a = adjust(_withholding(network, out), **settings)
+            a = adjust(_withholding(network, out, plan), **settings)
         except BaardaError as error:
             turns.append(Fold(labels, None, None, str(error)))
             continue
@@ -224,7 +227,7 @@ def cross_validate(
             turns.append(Fold(labels, None, None, "the adjustment did not converge"))
             continue
         turns.append(Fold(labels, a.sigma0, a.redundancy))
-        e = _differences(a, set(labels))
+        e = _differences(a, set(labels)) if not plan[out].any() else _predicted(a, out, plan)
         if e is None:
             continue
         scale = a.variance_factor if o.sigma == "aposteriori" else 1.0
@@ -264,10 +267,21 @@ def _note(turns: list[Fold], rows: list[Withheld], control: Ints, o: Options) ->
     return " ".join(said)
 
 
-def _withholding(network: Network, out: Ints) -> Network:
-    """Turn control points into check points."""
+def _plan_only(network: Network) -> NDArray[np.bool_]:
+    """Return which points one radar track alone sees: range and squint determine two coordinates, the third must be given."""
+    radar, other = np.zeros(len(network.points.labels), dtype=int), np.zeros(len(network.points.labels), dtype=int)
+    for group in network.observations:
+        for end in group.points_of():
+            (radar if isinstance(group, RangeDoppler) else other)[:] += np.bincount(end, minlength=len(radar))
+    return np.asarray((radar == 1) & (other == 0))
+
+
+def _withholding(network: Network, out: Ints, plan: NDArray[np.bool_]) -> Network:
+    """Turn control points into check points; of those in `plan` only X and Y become free."""
     points = network.points
     roles, states, start = np.array(points.roles), np.array(points.states), np.array(points.coordinates)
+    heights, out = out[plan[out]], out[~plan[out]]
+    states[heights, :2] = FREE
     roles[out], states[out] = CHECK, FREE
     # the given coordinates only start the adjustment
     start[out] = np.where(np.isfinite(start[out]), start[out], points.given[out])
@@ -291,6 +305,25 @@ def _differences(a: Adjustment, labels: set[str]) -> Estimates | None:
         e.cofactors[square],
         None if e.reference_covariance is None else e.reference_covariance[square],
         tuple(e.groups[i] for i in at),
+    )
+
+
+def _predicted(a: Adjustment, out: Ints, plan: NDArray[np.bool_]) -> Estimates | None:
+    """Return the differences of withheld points of which some keep their height."""
+    points = a.network.points
+    wanted = np.isfinite(points.given[out]) & ~a.aside[out, None] & ~(plan[out, None] & (np.arange(3) == 2))
+    rows, axes = np.nonzero(wanted)
+    rows = out[rows]
+    if not len(rows):
+        return None
+    q = a.cofactors.of(a.numbering["point"].columns.reshape(-1, 3)[rows, axes])
+    survey = np.nan_to_num(points.covariance(np.arange(len(points.labels))))[rows[:, None], axes[:, None], axes[None, :]]
+    return Estimates(
+        tuple(f"point {points.labels[i]}: {AXES[k]}" for i, k in zip(rows, axes, strict=True)),
+        points.coordinates[rows, axes] - points.given[rows, axes],
+        0.5 * (q + q.T),
+        np.where(rows[:, None] == rows[None, :], survey, 0.0),
+        tuple(points.labels[i] for i in rows),
     )
 
 

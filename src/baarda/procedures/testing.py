@@ -22,6 +22,7 @@ from baarda.procedures.adjustment_laws import AdjustmentLaws, study_adjustment
 from baarda.procedures.external_reliability import external_effects
 
 if TYPE_CHECKING:
+    from baarda.procedures.audit import Audit
     from baarda.procedures.strategy import Strategy
     from baarda.procedures.variance_components import VarianceComponents
 
@@ -43,6 +44,8 @@ class Analysis:
         What procedures around the adjustment did: snooping, selection, cross-validation.
     components : VarianceComponents or None
         Variances of groups of observations, estimated before the adjustment.
+    audit : Audit or None
+        The solution of the source as it stands.
     """
 
     adjustment: Adjustment
@@ -50,6 +53,7 @@ class Analysis:
     tests: tuple[TestResult, ...]
     strategy: Strategy | None = None
     components: VarianceComponents | None = None
+    audit: Audit | None = None
 
     @cached_property
     def study(self) -> AdjustmentLaws | None:

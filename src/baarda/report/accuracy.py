@@ -13,7 +13,17 @@ from baarda.network import AXES
 from baarda.observations import Distances
 from baarda.procedures.testing import Analysis
 
-__all__ = ["ENOUGH_ASPRS", "ENOUGH_NSSDA", "Accuracy", "Lengths", "accuracy_json", "accuracy_of", "from_analysis", "length_deviations", "lengths_of"]
+__all__ = [
+    "ENOUGH_ASPRS",
+    "ENOUGH_NSSDA",
+    "Accuracy",
+    "Lengths",
+    "accuracy_json",
+    "accuracy_of",
+    "from_analysis",
+    "length_deviations",
+    "lengths_of",
+]
 
 Floats = NDArray[np.float64]
 

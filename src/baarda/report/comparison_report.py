@@ -9,16 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import baarda
 from baarda.formats.folder import Mark, whole_folder
 from baarda.hypotheses.base import TestResult
 from baarda.network import AXES, Table
+from baarda.observations import ImagePoints
 from baarda.procedures.comparison import Comparison, Epoch
 from baarda.report import page
 from baarda.report.result_folder import _parquet, plain, table_csv
 from baarda.report.sections._numbers import decimals_for, finer, fixed, names, plural, probability, significant
 from baarda.report.sections.base import Block, Cell, Column, DataTable, Paragraph, Section, Sentence, Tone, Verdict, say
+
+Floats = NDArray[np.float64]
 
 SCHEMA = "baarda.comparison/1"
 MARK = Mark("result.json", "baarda.comparison/", ("report.html", "result.json", "run.json", "tables", "figures"))
@@ -29,13 +33,14 @@ def sentences(c: Comparison) -> list[Sentence]:
     """Return the verdict."""
     out = [Sentence("datum", _datum(c), "info", "epochs")]
     if c.dependent:
-        size = np.linalg.norm(c.differences, axis=1)
+        size = _length(c.differences)
         i = int(np.argmax(size))
         unit, factor = finer(c.first.network.unit, size)
         shares = np.divide(np.abs(c.differences), c.sigmas, out=np.full(c.differences.shape, np.nan), where=c.sigmas > 0.0)
         text = say(
-            "Both adjust the same image points, so their differences are no random sample and nothing is tested: root mean square "
+            "Both adjust the same {what}, so their differences are no random sample and nothing is tested: root mean square "
             "{rms} {unit}, largest {largest} {unit} (point {label}), at most {share} standard deviations of the first.",
+            what="image points" if any(isinstance(g, ImagePoints) for g in c.first.observations) else "observations",
             rms=significant(float(np.sqrt((size**2).mean())) * factor),
             unit=unit,
             largest=significant(float(size[i]) * factor),
@@ -73,10 +78,8 @@ def sentences(c: Comparison) -> list[Sentence]:
     found = c.localisation
     if found is not None:
         at = [c.labels.index(p) for p in found.moved]
-        unit, factor = finer(c.first.network.unit, np.linalg.norm(c.differences[at], axis=1) if at else [])
-        told = [
-            f"{p} ({significant(float(np.linalg.norm(c.differences[i])) * factor)} {unit})" for p, i in zip(found.moved, at, strict=True)
-        ]
+        unit, factor = finer(c.first.network.unit, _length(c.differences[at]) if at else [])
+        told = [f"{p} ({significant(float(_length(c.differences[[i]])[0]) * factor)} {unit})" for p, i in zip(found.moved, at, strict=True)]
         text = say(
             "{count} moved: {names}; {stable} held stable {word}.",
             count=plural(len(found.moved), "point"),
@@ -122,6 +125,16 @@ def verdict(c: Comparison) -> list[str]:
     'Both adjust the same image poin'
     """
     return [page.printable(s.text) for s in sentences(c)]
+
+
+def _length(differences: Floats) -> Floats:
+    """Return the lengths of differences over the coordinates that are compared."""
+    return np.asarray(np.sqrt(np.nansum(differences**2, axis=1)))
+
+
+def _rms(values: Floats) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.sqrt((known**2).mean())) if len(known) else None
 
 
 # ---- sections ----
@@ -205,7 +218,7 @@ def _points(c: Comparison) -> DataTable:
     unit, factor = finer(c.first.network.unit, c.sigmas)
     decimals = decimals_for(c.sigmas * factor, 2)
     test = c.points
-    size = np.linalg.norm(c.differences, axis=1)
+    size = _length(c.differences)
     order = np.argsort(-(size if test is None else np.asarray(test.statistic)), kind="stable")[:_MOST]
     moved = set() if c.localisation is None else set(c.localisation.moved)
     rows: list[tuple[str | Cell, ...]] = []
@@ -266,7 +279,7 @@ def result_json(c: Comparison) -> dict[str, Any]:
         "localisation": None
         if c.localisation is None
         else {"moved": list(c.localisation.moved), "stable": list(c.localisation.stable), "decided": c.localisation.decided},
-        "rms": {axis.lower(): float(np.sqrt((c.differences[:, k] ** 2).mean())) for k, axis in enumerate(AXES)},
+        "rms": {axis.lower(): _rms(c.differences[:, k]) for k, axis in enumerate(AXES)},
         "rejected": c.rejected,
         "notes": list(c.notes),
         "verdict": verdict(c),

@@ -74,7 +74,9 @@ def check_vectors(
     def draw(figure: Any) -> None:
         axes = figure.add_subplot()
         o = _frame(axes, low, high, unit)
-        axes.plot(*(points[:, :2] - o).T, ".", color=MUTED, markersize=1.8, alpha=0.6, rasterized=len(points) > MOST_MARKS, label=tr("points"))
+        axes.plot(
+            *(points[:, :2] - o).T, ".", color=MUTED, markersize=1.8, alpha=0.6, rasterized=len(points) > MOST_MARKS, label=tr("points")
+        )
         x, y = (at[:, :2] - o).T
         axes.plot(x, y, "D", markerfacecolor="none", markeredgecolor=INK, markersize=5, markeredgewidth=0.9, label=tr("check points"))
         style = {"angles": "xy", "scale_units": "xy", "scale": 1.0 / scale, "width": 0.004, "zorder": 4}
@@ -128,9 +130,7 @@ def length_deviations(lengths: Floats, deviations: Floats, sigmas: Floats, unit:
     return drawn(name, (6.2, 3.2), draw)
 
 
-def cell_maps(
-    cells: Sequence[tuple[str, Floats, str]], frame: tuple[float, float, float, float], y_down: bool, name: str
-) -> str:
+def cell_maps(cells: Sequence[tuple[str, Floats, str]], frame: tuple[float, float, float, float], y_down: bool, name: str) -> str:
     """Return maps over the image side by side: one value per cell of a grid.
 
     Parameters
@@ -205,22 +205,30 @@ def space(scene: Scene, name: str = "block-in-space", most_ellipses: int = 60) -
         many = len(xy) > MOST_MARKS // 2
         if len(scene.rays):
             lines = np.stack([ends[scene.rays[:, 0], 0], xy[scene.rays[:, 1]]], axis=1)
-            axes.add_collection(LineCollection(list(lines), colors=ORANGE, linewidths=0.7, alpha=0.75, label=tr("suspected rays"), zorder=2))
+            axes.add_collection(
+                LineCollection(list(lines), colors=ORANGE, linewidths=0.7, alpha=0.75, label=tr("suspected rays"), zorder=2)
+            )
         chosen = scene.ellipsoids[:most_ellipses]
         if len(chosen):
             values, vectors = np.linalg.eigh(view @ scene.covariances[: len(chosen)] @ view.T)
             axis = 2.0 * scene.enlarged * np.sqrt(np.maximum(values, 0.0))
             angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
             style = {"units": "xy", "facecolors": "none", "edgecolors": MUTED, "linewidths": 0.6, "zorder": 3}
-            axes.add_collection(EllipseCollection(axis[:, 1], axis[:, 0], angle, offsets=xy[chosen], offset_transform=axes.transData, **style))
+            axes.add_collection(
+                EllipseCollection(axis[:, 1], axis[:, 0], angle, offsets=xy[chosen], offset_transform=axes.transData, **style)
+            )
         path = ends[:, [0, 1, 2, 0, 3, 4, 0, 1, 4, 3, 2], :]
         thin = 0.8 if len(path) <= 300 else 0.3
-        axes.add_collection(LineCollection(list(path), colors=BLUE, linewidths=thin, label=tr("cameras"), rasterized=len(path) > 1000, zorder=4))
+        axes.add_collection(
+            LineCollection(list(path), colors=BLUE, linewidths=thin, label=tr("cameras"), rasterized=len(path) > 1000, zorder=4)
+        )
         fixed = scene.sigmas[order] <= 0.0
         shown = axes.scatter(*xy[order[~fixed]].T, 9.0 if len(xy) <= 1000 else 3.0, c=scene.sigmas[order[~fixed]], cmap="viridis",
                              vmin=limits[0], vmax=limits[1], linewidth=0.0, rasterized=many, label=tr("points"), zorder=5)  # fmt: skip
         if fixed.any():
-            axes.scatter(*xy[order[fixed]].T, 30.0, marker="^", facecolors="none", edgecolors=INK, linewidths=0.9, label=tr("fixed points"), zorder=6)
+            axes.scatter(
+                *xy[order[fixed]].T, 30.0, marker="^", facecolors="none", edgecolors=INK, linewidths=0.9, label=tr("fixed points"), zorder=6
+            )
         # The three axes, from the lower left corner of the figure.
         corner, long = low - 0.02 * span, 0.08 * float(span.max())
         for k, letter in enumerate("XYZ"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import re
 import textwrap
 from html import escape
@@ -17,15 +19,18 @@ from baarda.report.sections.base import (
     Cell,
     DataTable,
     Figure,
+    Interactive,
     Items,
     Paragraph,
     Section,
     SectionMaker,
     Verdict,
+    say,
 )
 from baarda.report.sections.verdict import sentences
+from baarda.report.translation import current, tr
 
-__all__ = ["figures", "html", "sections", "text", "verdict"]
+__all__ = ["facts", "figures", "html", "name_of", "overall", "printable", "render", "sections", "text", "verdict"]
 
 _WIDTH = 100
 
@@ -130,11 +135,13 @@ def _text(block: Block) -> list[str]:
     if isinstance(block, Verdict):
         out: list[str] = []
         for s in block.sentences:
-            head = f"[{WORDS[s.tone]}] "
+            head = f"[{tr(WORDS[s.tone])}] "
             out += textwrap.wrap(head + s.text, _WIDTH, subsequent_indent="    ")
         return out
     if isinstance(block, Figure):
-        return textwrap.wrap(f"[Figure {block.name}: {block.title}. {block.alt}]", _WIDTH)
+        return textwrap.wrap(f"[{tr('Figure')} {block.name}: {block.title}. {block.alt}]", _WIDTH)
+    if isinstance(block, Interactive):
+        return textwrap.wrap(f"[{block.title}. {block.caption}]", _WIDTH)
     return _text_table(block)
 
 
@@ -184,13 +191,17 @@ def html(analysis: Analysis, made: list[Section]) -> str:
     -------
     str
     """
+    return render("Adjustment report", name_of(analysis), analysis.adjustment.status, overall(analysis, made), facts(analysis), made)
+
+
+def name_of(analysis: Analysis) -> str:
+    """Return what the report is about: the name of the project, else where it was read."""
     net = analysis.adjustment.network
-    name = net.name or net.path or "network in memory"
-    return render("Adjustment report", name, analysis.adjustment.status, _overall(analysis, made), _facts(analysis), made)
+    return net.name or net.path or tr("network in memory")
 
 
 def render(kind: str, name: str, status: str, overall: tuple[str, str], facts: list[tuple[str, str]], made: list[Section]) -> str:
-    """Return sections as one page: no scripts, nothing loaded from anywhere, readable offline.
+    """Return sections as one page: nothing loaded from anywhere, readable offline, without scripts but for a view in space.
 
     Parameters
     ----------
@@ -221,34 +232,51 @@ def render(kind: str, name: str, status: str, overall: tuple[str, str], facts: l
     )
     environment.tests["cell"] = lambda value: isinstance(value, Cell)
     context: dict[str, Any] = {
-        "kind": kind,
+        "kind": tr(kind),
+        "language": current(),
+        "tr": tr,
         "name": name,
         "status": status,
         "sections": [(n, s, [(type(b).__name__.lower(), b) for b in s.blocks]) for n, s in enumerate(made, start=1)],
-        "words": WORDS,
+        "words": {tone: tr(word) for tone, word in WORDS.items()},
         "inline": _inline,
         "glossary": glossary,
-        "facts": facts,
+        "facts": [(tr(key), value) for key, value in facts],
+        **_viewer(folder, made),
         "overall": overall,
     }
     return environment.get_template("report.html.j2").render(context)
 
 
-def _overall(analysis: Analysis, made: list[Section]) -> tuple[str, str]:
+def _viewer(folder: Any, made: list[Section]) -> dict[str, str]:
+    """Return the script of views in space and the rule that lets only it run; nothing where the page has none."""
+    if not any(isinstance(b, Interactive) for s in made for b in s.blocks):
+        return {"viewer": "", "allowed": ""}
+    script = (folder / "viewer.js").read_text(encoding="utf-8")
+    digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
+    return {"viewer": script, "allowed": f" script-src 'sha256-{digest}';"}
+
+
+def overall(analysis: Analysis, made: list[Section]) -> tuple[str, str]:
     """Return tone and words of the whole: the gravest sentence decides."""
     if not analysis.converged:
-        return "bad", "Not converged: no result"
+        return "bad", tr("Not converged: no result")
     tones = [s.tone for section in made for b in section.blocks if isinstance(b, Verdict) for s in b.sentences]
     bad, warn = tones.count("bad"), tones.count("warn")
-    needs = "needs attention" if warn == 1 else "need attention"
+    if bad and warn:
+        one = "{bad} of {total} statements failed a test, {warn} needs attention"
+        more = "{bad} of {total} statements failed a test, {warn} need attention"
+        return "bad", say(one if warn == 1 else more, bad=bad, warn=warn, total=len(tones))
     if bad:
-        return "bad", f"{bad} of {len(tones)} statements failed a test" + (f", {warn} {needs}" if warn else "")
+        return "bad", say("{bad} of {total} statements failed a test", bad=bad, total=len(tones))
     if warn:
-        return "warn", f"No test failed; {warn} of {len(tones)} statements {needs}"
-    return "good", "No test failed"
+        one = "No test failed; {warn} of {total} statements needs attention"
+        more = "No test failed; {warn} of {total} statements need attention"
+        return "warn", say(one if warn == 1 else more, warn=warn, total=len(tones))
+    return "good", tr("No test failed")
 
 
-def _facts(analysis: Analysis) -> list[tuple[str, str]]:
+def facts(analysis: Analysis) -> list[tuple[str, str]]:
     a = analysis.adjustment
     net = a.network
     facts = [("images", str(len(net.images.labels))), ("points", str(int((~a.aside).sum()))), ("observations n", str(a.count))]

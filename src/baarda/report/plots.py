@@ -14,12 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from baarda.report.translation import tr
+
 Floats = NDArray[np.float64]
 
 INK, MUTED, LINE = "#24292f", "#656d76", "#c8ced6"
 # Okabe & Ito: told apart without red-green vision; line styles differ as well.
 BLUE, ORANGE, GREEN, PURPLE = "#0072b2", "#d55e00", "#009e73", "#b0568f"
-_FONTS = "system-ui, 'Segoe UI', 'Liberation Sans', Arial, sans-serif"
+FONTS = "system-ui, 'Segoe UI', 'Liberation Sans', Arial, sans-serif"
 MOST_MARKS = 5000  # beyond, marks are drawn as a picture
 
 _STYLE: dict[str, Any] = {
@@ -109,7 +111,7 @@ def _own(svg: str, name: str) -> str:
         text = re.sub(r'\b(id|xlink:href|href)="(#?)([A-Za-z][^":]*)"', rf'\1="\2{name}-\3"', match[0])
         text = re.sub(r"url\(#([^)]*)\)", rf"url(#{name}-\1)", text)
         text = re.sub(r"(\d\.\d{2})\d+\b", r"\1", text) if " d=" in text else text  # paths: a hundredth of a point is enough
-        return re.sub(r"(font-family: |font: [^'\";]*px )[^;\"]*", rf"\1{_FONTS}", text)
+        return re.sub(r"(font-family: |font: [^'\";]*px )[^;\"]*", rf"\1{FONTS}", text)
 
     # Inside of text matplotlib writes no bare '<' or '>': what stands between them is a tag.
     return re.sub(r"<[^<>]*>", tag, svg)
@@ -166,15 +168,15 @@ def histogram(
 
     def draw(figure: Any) -> None:
         axes = figure.add_subplot()
-        axes.bar(edges[:-1], density, width, align="edge", color=BLUE, alpha=0.22, edgecolor=BLUE, linewidth=0.5, label="residuals")
+        axes.bar(edges[:-1], density, width, align="edge", color=BLUE, alpha=0.22, edgecolor=BLUE, linewidth=0.5, label=tr("residuals"))
         curves = law_curves(laws, x)
         for text, at, y, colour, dashes in curves:
             axes.plot(at, y, color=colour, linestyle=dashes, linewidth=1.5, label=text)
         usual = max([float(density.max()), *(float(np.median(y[np.abs(at) < 0.3])) for _, at, y, _, _ in curves)])
         axes.set_ylim(0.0, 1.15 * usual)
         axes.set_xlim(-reach, reach)
-        axes.set_xlabel(label)
-        axes.set_ylabel("density (per unit)")
+        axes.set_xlabel(tr(label))
+        axes.set_ylabel(tr("density (per unit)"))
         axes.legend(loc="upper right")
         _quiet(axes, "y")
 
@@ -209,13 +211,13 @@ def quantiles(
 
     def draw(figure: Any) -> None:
         axes = figure.add_subplot()
-        axes.fill_between(x, low, high, color=MUTED, alpha=0.25, linewidth=0, label="normal law, 95 % band of each mark")
+        axes.fill_between(x, low, high, color=MUTED, alpha=0.25, linewidth=0, label=tr("normal law, 95 % band of each mark"))
         axes.plot(x, x, color=INK, linewidth=0.9, linestyle=(0, (5, 2)))
         if other is not None:
             axes.plot(x, other[1](q), color=ORANGE, linewidth=1.4, label=other[0])
-        axes.plot(x, y[rank - 1], ".", color=BLUE, markersize=3.2, label="residuals")
-        axes.set_xlabel("quantile of the normal law")
-        axes.set_ylabel(label)
+        axes.plot(x, y[rank - 1], ".", color=BLUE, markersize=3.2, label=tr("residuals"))
+        axes.set_xlabel(tr("quantile of the normal law"))
+        axes.set_ylabel(tr(label))
         axes.legend(loc="upper left")
         _quiet(axes)
 
@@ -252,7 +254,7 @@ def heat_map(matrix: Floats, labels: Sequence[str], name: str) -> str:
                 text = f"{lower[i, j]:.2f}".replace("-0.00", "0.00")
                 axes.text(j + 0.5, i + 0.5, text, ha="center", va="center", fontsize=7.5, color=colour)
         bar = figure.colorbar(image, ax=axes, shrink=0.75, aspect=18)
-        bar.set_label("correlation")
+        bar.set_label(tr("correlation"))
         bar.outline.set_visible(False)
 
     return drawn(name, (side + 0.8, side), draw)
@@ -336,8 +338,8 @@ def vectors(
         for spine in axes.spines.values():
             spine.set_visible(False)
         axes.set_aspect("equal")
-        axes.set_xlabel("image x (px)")
-        axes.set_ylabel(f"image y (px), {'downwards' if y_down else 'upwards'}")
+        axes.set_xlabel(tr("image x (px)"))
+        axes.set_ylabel(f"{tr('image y (px)')}, {tr('downwards' if y_down else 'upwards')}")
         axes.grid(True)
         axes.tick_params(length=3)
         # The scale arrow stands above the frame, in the units of the axes: as long as a vector of that size.
@@ -399,11 +401,11 @@ def plan(
             at = np.flatnonzero((kinds == kind) & free)
             if len(at):
                 colours = {"c": sigmas[at], "cmap": "viridis", "vmin": limits[0], "vmax": limits[1]}
-                shown = axes.scatter(*(points[at][:, [0, k]] - origin[[0, k]]).T, area, label=f"{kind} points", **colours, **style, **rim)
+                shown = axes.scatter(*(points[at][:, [0, k]] - origin[[0, k]]).T, area, label=tr(f"{kind} points"), **colours, **style, **rim)
             at = np.flatnonzero((kinds == kind) & ~free)
             if len(at):
                 axes.scatter(points[at, 0] - origin[0], points[at, k] - origin[k], area, facecolors="none", edgecolors=INK, linewidths=0.9,
-                             label=f"fixed {kind} points", **style)  # fmt: skip
+                             label=tr(f"fixed {kind} points"), **style)  # fmt: skip
         x, y = cameras[:, 0] - origin[0], cameras[:, k] - origin[k]
         many = len(cameras) > MOST_MARKS
         ends = np.stack([cameras[:, [0, k]], cameras[:, [0, k]] + reach * directions[:, [0, k]]], axis=1) - origin[[0, k]]
@@ -411,7 +413,7 @@ def plan(
 
         axes.add_collection(LineCollection(list(ends), colors=ORANGE, linewidths=0.9, rasterized=many, zorder=5))
         axes.scatter(x, y, 30.0 if len(cameras) <= 200 else 8.0, marker="s", facecolors="none", edgecolors=ORANGE, linewidths=1.2,
-                     label="images, viewing direction", rasterized=many, zorder=5)  # fmt: skip
+                     label=tr("images, viewing direction"), rasterized=many, zorder=5)  # fmt: skip
         if len(cameras) <= 30:
             for label, a, b in zip(camera_labels, x.tolist(), y.tolist(), strict=True):
                 axes.annotate(label[:16], (a, b), xytext=(4, 4), textcoords="offset points", fontsize=7, color=MUTED)
@@ -420,7 +422,7 @@ def plan(
         axes.ticklabel_format(useOffset=False, style="plain")
         axes.set_xlabel(_axis("X", origin[0], unit))
         axes.set_ylabel(_axis("XYZ"[k], origin[k], unit))
-        axes.set_title("Plan" if k == 1 else "Elevation", loc="left")
+        axes.set_title(tr("Plan" if k == 1 else "Elevation"), loc="left")
         axes.grid(True)
         axes.tick_params(length=3)
         return shown
@@ -433,7 +435,7 @@ def plan(
         figure.legend(handles, texts, loc="outside lower center", ncols=4)
         if shown is not None:
             bar = figure.colorbar(shown, ax=[upper, lower], shrink=0.6, aspect=28, extend="both")
-            bar.set_label(f"spatial standard deviation ({sigma_unit})")
+            bar.set_label(f"{tr('spatial standard deviation')} ({sigma_unit})")
             bar.outline.set_visible(False)
 
     return drawn(name, (7.4, float(np.clip(5.6 * sum(ratio) + 1.6, 5.0, 11.0))), draw)
@@ -463,18 +465,18 @@ def bars(values: Floats, beyond: Sequence[bool], labels: Sequence[str], axis: st
     def draw(figure: Any) -> None:
         axes = figure.add_subplot()
         x = np.arange(1, len(values) + 1)
-        axes.bar(x[~rejected], values[~rejected], 0.75, color=BLUE, alpha=0.55, label="agrees with the others")
+        axes.bar(x[~rejected], values[~rejected], 0.75, color=BLUE, alpha=0.55, label=tr("agrees with the others"))
         if rejected.any():
             style = {"hatch": "////", "edgecolor": "#ffffff", "linewidth": 0.0}
-            axes.bar(x[rejected], values[rejected], 0.75, color=ORANGE, alpha=0.75, label=word, **style)
+            axes.bar(x[rejected], values[rejected], 0.75, color=ORANGE, alpha=0.75, label=tr(word), **style)
         axes.axhline(1.0, color=INK, linewidth=0.9, linestyle=(0, (5, 2)))
         axes.set_xlim(0.25, len(values) + 0.75)
         if len(values) <= 40:
             short = [t if len(t) <= 14 else f"{t[:12]}.." for t in labels]
             upright = sum(len(t) + 1 for t in short) > 90
             axes.set_xticks(x, short, **({"rotation": 60, "ha": "right", "rotation_mode": "anchor"} if upright else {}))
-        axes.set_xlabel("image" if len(values) <= 40 else "image, in the order of the table")
-        axes.set_ylabel(axis)
+        axes.set_xlabel(tr("image" if len(values) <= 40 else "image, in the order of the table"))
+        axes.set_ylabel(tr(axis))
         axes.margins(y=0.15)
         figure.legend(loc="outside upper left", ncols=2)
         _quiet(axes, "y")

@@ -22,10 +22,11 @@ from baarda.hypotheses.base import TestResult
 from baarda.network import Table
 from baarda.observations import Direct, ImageCoordinates, ImagePoints
 from baarda.procedures.testing import Analysis
+from baarda.report.accuracy import accuracy_json
 from baarda.report.laws_json import critical_json, laws_json, study_json
 
 SCHEMA = "baarda.result/1"
-MARK = Mark("result.json", "baarda.result/", ("report.html", "result.json", "run.json", "tables", "figures", "project"))
+MARK = Mark("result.json", "baarda.result/", ("report.html", "report.pdf", "result.json", "run.json", "tables", "figures", "project"))
 
 
 def plain(value: Any) -> Any:
@@ -109,7 +110,9 @@ def result_json(analysis: Analysis) -> dict[str, Any]:
         "cross_validation": None if chosen is None or chosen.cross_validation is None else chosen.cross_validation.as_dict(),
         "strategy": [] if chosen is None else [vars(stage) for stage in chosen.stages],
         "variance_components": None if analysis.components is None else analysis.components.as_dict(),
+        "audit": None if analysis.audit is None else plain(analysis.audit.as_dict()),
         "check_points": _check_points(analysis) if analysis.converged else [],
+        "accuracy": accuracy_json(analysis),
         "rms": _rms(a) | {"check_intervals": _intervals(analysis)},
         "software": {
             "name": "baarda",
@@ -265,7 +268,14 @@ def _cells(column: np.ndarray[Any, Any]) -> list[str]:
     return [str(v) for v in column.tolist()]
 
 
-def write_folder(analysis: Analysis, out: str | Path, tables: str = "csv", run: dict[str, Any] | None = None) -> Path:
+def write_folder(
+    analysis: Analysis,
+    out: str | Path,
+    tables: str = "csv",
+    run: dict[str, Any] | None = None,
+    spoken: str = "en",
+    pdf: bool = False,
+) -> Path:
     """Write the result folder.
 
     Parameters
@@ -277,6 +287,10 @@ def write_folder(analysis: Analysis, out: str | Path, tables: str = "csv", run: 
         Format of the tables.
     run : dict, optional
         What differs from run to run (timings), for `run.json`.
+    spoken : str
+        Language of the report and its figures; JSON and tables are English.
+    pdf : bool
+        Whether to write `report.pdf`, too (extra `pdf`).
 
     Returns
     -------
@@ -289,6 +303,8 @@ def write_folder(analysis: Analysis, out: str | Path, tables: str = "csv", run: 
         If it cannot be written; nothing is left behind.
     """
     from baarda.report import page
+    from baarda.report.pdf import pdf as typeset
+    from baarda.report.translation import language
 
     target = Path(out)
     a, o = analysis.adjustment, analysis.options
@@ -299,11 +315,15 @@ def write_folder(analysis: Analysis, out: str | Path, tables: str = "csv", run: 
         "unknowns": a.unknown_table(o.sigma),
     }
     document = json.dumps(result_json(analysis), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-    sections = page.sections(analysis)
-    html = page.html(analysis, sections)
+    with language(spoken):
+        sections = page.sections(analysis)
+        html, figures = page.html(analysis, sections), page.figures(sections)
+        printed = typeset(analysis, sections) if pdf else None
     with whole_folder(target, MARK) as folder:
         _write(folder / "result.json", document)
         _write(folder / "report.html", html)
+        if printed is not None:
+            (folder / "report.pdf").write_bytes(printed)
         (folder / "tables").mkdir()
         for name, table in content.items():
             if tables == "parquet":
@@ -311,7 +331,7 @@ def write_folder(analysis: Analysis, out: str | Path, tables: str = "csv", run: 
             else:
                 _write(folder / "tables" / f"{name}.csv", table_csv(table))
         (folder / "figures").mkdir()
-        for name, svg in page.figures(sections).items():
+        for name, svg in figures.items():
             _write(folder / "figures" / f"{name}.svg", svg)
         write_project(a.network, folder / "project")
         _write(folder / "run.json", json.dumps(plain(run or {}), indent=1, allow_nan=False) + "\n")

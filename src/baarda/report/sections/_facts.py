@@ -14,6 +14,7 @@ from baarda.hypotheses.base import TestResult
 from baarda.network import AXES, CONTROL
 from baarda.observations import Direct, ImageCoordinates, ImagePoints
 from baarda.procedures.testing import Analysis
+from baarda.report.sections.base import say
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -79,7 +80,7 @@ def label_of(analysis: Analysis, row: int) -> str:
     g = int(np.searchsorted(a.offsets, row, side="right")) - 1
     image, point = table["image"][row], table["point"][row]
     head = "" if isinstance(a.groups[g], (ImageCoordinates, ImagePoints)) else f"{table['group'][row]},"
-    parts = (head, f"image {image}" if image else "", f"point {point}" if point else "", str(table["component"][row]))
+    parts = (head, say("image {name}", name=image) if image else "", say("point {name}", name=point) if point else "", str(table["component"][row]))
     return " ".join(part for part in parts if part)
 
 
@@ -173,7 +174,7 @@ def spatial(sigmas: Floats) -> Floats:
 
 def first(count: int, most: int, where: str) -> str:
     """Return the note of a shortened table, empty where it is whole."""
-    return f"The first {most} of {count} rows; all are in {where}." if count > most else ""
+    return say("The first {most} of {count} rows; all are in {where}.", most=most, count=count, where=where) if count > most else ""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from baarda.report import plots
 from baarda.report.sections._numbers import MISSING, fixed, names, plural, probability, significant
 from baarda.report.sections.base import Block, Cell, Column, DataTable, Figure, Tone, say
 from baarda.report.sections.verdict import law_name
+from baarda.report.translation import tr
 
 _DRAWN = ("normal", "radico", "lineo", "modulated_normal")
 _LETTERS = {"anderson_darling": "A²", "chi_square": "chi-square"}
@@ -104,11 +105,11 @@ def laws_table(laws: LawsStudied, alpha: float) -> DataTable:
     rows: list[tuple[str | Cell, ...]] = []
     for s in laws.laws:
         f = s.fit
-        values = ", ".join(f"{k} = {significant(v, 3)}" for k, v in f.parameters.items() if k in f.estimated) or "none"
+        values = ", ".join(f"{k} = {significant(v, 3)}" for k, v in f.parameters.items() if k in f.estimated) or tr("none")
         rejected = laws.rejected(s)
         rows.append(
             (
-                f.law.replace("_", " ") + (" (smallest AIC)" if s is laws.best else ""),
+                f.law.replace("_", " ") + (tr(" (smallest AIC)") if s is laws.best else ""),
                 values,
                 Cell("") if rejected is None else decision(rejected),
                 *(_p(s, name) for name in ("anderson_darling", "cramer_von_mises", "kolmogorov")),
@@ -125,12 +126,12 @@ def laws_table(laws: LawsStudied, alpha: float) -> DataTable:
             )
         )
     judge = _LETTERS[laws.judged_by(laws.laws[0])]
-    through = " for adjusted residuals: null law by simulated adjustments" if laws.adjusted else " by simulated samples"
+    through = tr(" for adjusted residuals: null law by simulated adjustments" if laws.adjusted else " by simulated samples")
     columns = (
         Column("law", "", "", "left"),
         Column("estimated", "", "values found by maximum likelihood", "left"),
-        Column("decision", "", f"by {judge}, at level {alpha:.3g}", "left"),
-        Column("p of A²", "", f"Anderson-Darling, weighted for the tails,{through}"),
+        Column("decision", "", say("by {judge}, at level {alpha}", judge=judge, alpha=f"{alpha:.3g}"), "left"),
+        Column("p of A²", "", say("Anderson-Darling, weighted for the tails,{through}", through=through)),
         Column("p of W²", "", f"Cramér-von Mises,{through}"),
         Column("p of D", "", f"Kolmogorov,{through}"),
         *((Column("p of A², independent", "", "the same Anderson-Darling as if the residuals were independent"),) if laws.adjusted else ()),
@@ -139,7 +140,7 @@ def laws_table(laws: LawsStudied, alpha: float) -> DataTable:
         Column("limit", "", "critical value of chi-square"),
         Column("p, asymptotic", "", "probability of a chi-square as large for independent values, by the chi-square law"),
         *((Column("p, independent", "", "the same by simulated samples of independent values"),) if laws.adjusted else ()),
-        Column("p, adjusted" if laws.adjusted else "p, simulated", "", f"the same{through}"),
+        Column("p, adjusted" if laws.adjusted else "p, simulated", "", say("the same{through}", through=through)),
         Column("log L", "", "logarithm of the likelihood: larger is better"),
         Column("AIC", "", "Akaike's criterion, 2 k - 2 log L: smaller is better"),
         Column("BIC", "", "Schwarz's criterion, k log n - 2 log L: smaller is better"),

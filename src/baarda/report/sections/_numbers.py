@@ -8,6 +8,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from baarda.report.translation import tr
+
 MISSING = "–"
 _MOST_DECIMALS = 6  # of a value; beyond, powers of ten
 _NO_MORE = 9  # of a column
@@ -168,7 +170,7 @@ def names(labels: Iterable[str], most: int = 6) -> str:
     known: Sequence[str] = list(labels)
     if len(known) <= most:
         return ", ".join(known)
-    return f"{', '.join(known[:most])} and {len(known) - most} more"
+    return tr("{names} and {count} more").format(names=", ".join(known[:most]), count=len(known) - most)
 
 
 def plural(count: int, word: str, words: str = "") -> str:
@@ -179,4 +181,4 @@ def plural(count: int, word: str, words: str = "") -> str:
     >>> plural(1, "image"), plural(3, "image")
     ('1 image', '3 images')
     """
-    return f"{count} {word if count == 1 else words or word + 's'}"
+    return f"{count} {tr(word if count == 1 else words or word + 's')}"

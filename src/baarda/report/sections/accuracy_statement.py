@@ -47,13 +47,17 @@ def _statement(a: Accuracy, told: str, factor: float) -> list[Block]:
     chosen: Tone = "warn" if tone == "warn" else "info"
     blocks: list[Block] = [Paragraph(say(text, **fields), chosen)]
     if not a.survey_stated:
-        blocks.append(Paragraph(tr("The survey states no precision of the check points: its error is counted as zero in these figures."), "warn"))
+        blocks.append(
+            Paragraph(tr("The survey states no precision of the check points: its error is counted as zero in these figures."), "warn")
+        )
     elif any(s > 0.5 * f for s, f in zip(a.survey, (a.rmse_h_fit, a.rmse_v_fit), strict=True)):
         text = (
             "The survey of the check points ({h} {unit} horizontal, {v} {unit} vertical) is not twice as accurate as what it tests, as the "
             "standards ask."
         )
-        blocks.append(Paragraph(say(text, h=fixed(a.survey[0] * factor, decimals), v=fixed(a.survey[1] * factor, decimals), unit=told), "warn"))
+        blocks.append(
+            Paragraph(say(text, h=fixed(a.survey[0] * factor, decimals), v=fixed(a.survey[1] * factor, decimals), unit=told), "warn")
+        )
     biased = [k for k in range(3) if a.points[k] > 1 and abs(a.mean[k]) > _NOTABLE * a.rmse[k]]
     if biased:
         text = (
@@ -130,7 +134,15 @@ def _vectors(analysis: Analysis, unit: str) -> list[Block]:
         name=points.labels[at[most]],
         arrow=arrow,
     )
-    return [Figure("check-vectors", "Check points: differences from the survey", caption, say("Arrows over a plan. {caption}", caption=caption), svg)]
+    return [
+        Figure(
+            "check-vectors",
+            "Check points: differences from the survey",
+            caption,
+            say("Arrows over a plan. {caption}", caption=caption),
+            svg,
+        )
+    ]
 
 
 def _lengths(lengths: Lengths, unit: str) -> list[Block]:
@@ -158,7 +170,9 @@ def _lengths(lengths: Lengths, unit: str) -> list[Block]:
         count=len(rows),
     )
     if lengths.largest is not None:
-        note += " " + say("The largest is {most} {unit}.", most=fixed(abs(lengths.deviations[lengths.largest]) * factor, decimals), unit=told)
+        note += " " + say(
+            "The largest is {most} {unit}.", most=fixed(abs(lengths.deviations[lengths.largest]) * factor, decimals), unit=told
+        )
     if not all(held.values()):
         note += " " + say(
             "It is no acceptance test: the guideline asks for seven lines of at least five lengths each (35; here {seen}), the longest at least "
@@ -172,8 +186,13 @@ def _lengths(lengths: Lengths, unit: str) -> list[Block]:
     blocks: list[Block] = [DataTable("Length deviations", columns, tuple(rows[:MOST_ROWS]), note.strip())]
     if seen >= 3:
         svg = drawings.length_deviations(lengths.given, lengths.deviations * factor, lengths.sigmas * factor, unit, told)
-        caption = say("Length deviation of {count} lengths over their length, with the interval of twice the predicted standard deviation.", count=seen)
-        blocks.append(Figure("length-deviations", "Length deviations over length", caption, say("Marks with bars. {caption}", caption=caption), svg))
+        caption = say(
+            "Length deviation of {count} lengths over their length, with the interval of twice the predicted standard deviation.",
+            count=seen,
+        )
+        blocks.append(
+            Figure("length-deviations", "Length deviations over length", caption, say("Marks with bars. {caption}", caption=caption), svg)
+        )
     return blocks
 
 

@@ -44,7 +44,7 @@ def _row(test: TestResult, mark: str) -> tuple[str | Cell, ...]:
         return (head, Cell("not testable", "info"), "", "", "", level, test.law_name, "")
     i = int(np.lexsort((-np.abs(np.nan_to_num(statistic)), np.where(np.isfinite(p), p, np.inf)))[0])
     decision = Cell(say("{beyond} of {tested} rejected", beyond=beyond, tested=tested), _tone(test, bool(beyond), "warn"))
-    label = test.labels[i] if test.labels else f"number {i + 1}"
+    label = test.labels[i] if test.labels else say("number {i}", i=i + 1)
     return (head, decision, _short(float(statistic[i])), _limits(test), probability(float(p[i])), level, test.law_name, label)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -218,20 +219,40 @@ def translated(section: Section) -> Section:
     return replace(section, title=tr(section.title), blocks=tuple(_translated(b) for b in section.blocks))
 
 
+def _told(text: str) -> str:
+    """Translate a fixed text, else what it is joined from, the longest parts first; a name in the first of two lines stays."""
+    known = tr(text)
+    if known != text or not any(mark in text for mark in (". ", ": ", "\n", " [")):
+        return known
+    head, line, rest = text.partition("\n")
+    if line:
+        return f"{head}\n{_told(rest)}"
+    rest, _, mark = text.rpartition(" [")
+    if rest and mark.rstrip("]").isdigit():
+        return f"{_told(rest)} [{mark}"
+    parts, out, at = re.split(r"(?<=[.:]) ", text), [], 0
+    while at < len(parts):
+        tried = ((end, " ".join(parts[at:end])) for end in range(len(parts), at, -1))
+        end, said = next(((e, tr(s)) for e, s in tried if tr(s) != s), (at + 1, parts[at]))
+        out.append(said)
+        at = end
+    return " ".join(out)
+
+
 def _translated(block: Block) -> Block:
     if isinstance(block, Paragraph):
-        return replace(block, text=tr(block.text))
+        return replace(block, text=_told(block.text))
     if isinstance(block, Items):
-        return replace(block, intro=tr(block.intro), entries=tuple(tr(e) for e in block.entries))
+        return replace(block, intro=tr(block.intro), entries=tuple(_told(e) for e in block.entries))
     if isinstance(block, Verdict):
         return Verdict(tuple(replace(s, subject=tr(s.subject), text=tr(s.text)) for s in block.sentences))
     if isinstance(block, (Figure, Interactive)):
-        return replace(block, title=tr(block.title), caption=tr(block.caption), alt=tr(block.alt))
+        return replace(block, title=tr(block.title), caption=_told(block.caption), alt=_told(block.alt))
     said = [c.name not in _NAMES for c in block.columns]
     rows = tuple(tuple(_word(cell) if told else cell for cell, told in zip(row, said, strict=True)) for row in block.rows)
     columns = tuple(replace(c, name=tr(c.name), unit=tr(c.unit), meaning=tr(c.meaning)) for c in block.columns)
-    return replace(block, caption=tr(block.caption), note=tr(block.note), columns=columns, rows=rows)
+    return replace(block, caption=tr(block.caption), note=_told(block.note), columns=columns, rows=rows)
 
 
 def _word(cell: str | Cell) -> str | Cell:
-    return replace(cell, text=tr(cell.text)) if isinstance(cell, Cell) else tr(cell)
+    return replace(cell, text=_told(cell.text)) if isinstance(cell, Cell) else _told(cell)

@@ -10,6 +10,7 @@ from baarda.report import plots
 from baarda.report.sections._facts import MOST_ROWS, correlation_matrix, first, result_of, scaling
 from baarda.report.sections._numbers import MISSING, fixed, powers, probability, significant, with_sigma
 from baarda.report.sections.base import Block, Cell, Column, DataTable, Figure, SectionMaker, say
+from baarda.report.translation import tr
 
 _MOST_MAPS = 4
 
@@ -64,7 +65,7 @@ def _parameters(analysis: Analysis) -> DataTable:
         Column("value", "", "adjusted value"),
         Column("sigma", "", say("standard deviation, {scaling}", scaling=scaling(analysis))),
         Column("initial", "", "value before the adjustment"),
-        Column("t", "", "value / sigma: test that an additional parameter is zero" + limit),
+        Column("t", "", tr("value / sigma: test that an additional parameter is zero") + limit),
         Column("p", "", "probability of a |t| as large if the parameter were zero"),
         Column("decision", "", "", "left"),
         Column("state", "", "free: estimated; observed: estimated with a prior sigma; fixed: held", "left"),
@@ -120,7 +121,7 @@ def _correlations(analysis: Analysis) -> list[Block]:
         )
         blocks.append(Figure(f"correlations-{i + 1}", title, caption, alt, figure))
         if len(at) <= 20:
-            blocks.append(DataTable(f"{title}, numbers", columns, rows, folded=True))
+            blocks.append(DataTable(say("{title}, numbers", title=title), columns, rows, folded=True))
     return blocks
 
 

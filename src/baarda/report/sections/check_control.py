@@ -129,8 +129,8 @@ def _prior_and_posterior(analysis: Analysis, e: Estimates) -> list[Block]:
         rows.append((label, *numbers, *(fixed(float(v), 3) for v in shares[label][1])))
     columns = (
         Column("point", "", "", "left"),
-        *(Column(f"prior s{axis}", unit, say("given standard deviation, {scaling}", scaling=scaling(analysis))) for axis in AXES),
-        *(Column(f"posterior s{axis}", unit, "of the adjusted coordinate") for axis in AXES),
+        *(Column(say("prior s{axis}", axis=axis), unit, say("given standard deviation, {scaling}", scaling=scaling(analysis))) for axis in AXES),
+        *(Column(say("posterior s{axis}", axis=axis), unit, "of the adjusted coordinate") for axis in AXES),
         *(
             Column(f"r {axis}", "", "redundancy number: share of an error of the given coordinate that shows in its residual")
             for axis in AXES
@@ -156,7 +156,7 @@ def _joint(test: TestResult | None, words: str) -> list[Block]:
         Column("all together", "", "", "left"),
         Column("T", "", "test statistic per coordinate"),
         Column("law", "", "under the null hypothesis", "left"),
-        Column("limit", "", f"critical value at level {test.alpha:.3g}"),
+        Column("limit", "", say("critical value at level {alpha}", alpha=f"{test.alpha:.3g}")),
         Column("p", "", "probability of a T as large"),
         Column("decision", "", "", "left"),
     )

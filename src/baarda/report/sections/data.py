@@ -59,7 +59,7 @@ def _model(analysis: Analysis) -> list[Block]:
         ("rotation", "camera from object, M = R3(kappa) R2(phi) R1(omega); the camera looks along -z, x right, y up"),
     ]
     columns = (Column("item", "", "", "left"), Column("choice", "", "", "left"))
-    return [DataTable("Model", columns, tuple(rows), "" if len(net.cameras) <= 8 else f"The first 8 of {len(net.cameras)} cameras.")]
+    return [DataTable("Model", columns, tuple(rows), "" if len(net.cameras) <= 8 else say("The first {most} of {count} cameras.", most=8, count=len(net.cameras)))]
 
 
 def _apriori(analysis: Analysis) -> DataTable:
@@ -70,7 +70,7 @@ def _apriori(analysis: Analysis) -> DataTable:
         same = isinstance(group, ImagePoints) or group.name.startswith(("control", "distances"))
         unit, factor = finer(group.unit, s) if same else (group.unit, 1.0)
         low, high = float(s.min()) * factor, float(s.max()) * factor
-        size = f"{low:.4g}" if np.isclose(low, high) else f"{low:.3g} to {high:.3g}"
+        size = f"{low:.4g}" if np.isclose(low, high) else say("{low} to {high}", low=f"{low:.3g}", high=f"{high:.3g}")
         rows.append((group.name, str(len(group) * len(group.components)), f"{size} {unit}".strip()))
     columns = (
         Column("group", "", "observations of one kind", "left"),

@@ -37,14 +37,14 @@ def _orientation(analysis: Analysis) -> DataTable:
         spread = column(np.where(sigma > 0.0, sigma, np.nan) * (1.0 if angle else factor), 2)
         for row, v, s in zip(rows, shown, spread, strict=False):
             row += [v, s]
-        meaning = f"rotation about the {'XYZ'[k - 3]} axis" if angle else "projection centre"
+        meaning = say("rotation about the {axis} axis", axis="XYZ"[k - 3]) if angle else "projection centre"
         columns += [
             Column(name, "°" if angle else a.network.unit, meaning),
             Column(f"s {name}", "°" if angle else unit, say("standard deviation, {scaling}", scaling=scaling(analysis))),
         ]
     note = first(len(table), MOST_ROWS, "tables/images.csv")
     if any(MISSING in row for row in rows):
-        note = f"{note} {MISSING}: fixed, or not defined at the singularity of the angles.".strip()
+        note = f"{note} {say('{mark}: fixed, or not defined at the singularity of the angles.', mark=MISSING)}".strip()
     return DataTable("Exterior orientation", tuple(columns), tuple(tuple(row) for row in rows), note)
 
 
@@ -100,7 +100,7 @@ def _precision(analysis: Analysis) -> list[Block]:
         svg = plots.bars(
             np.nan_to_num(s0), beyond.tolist(), table["image"].tolist(), "s0 of the image / of all", "differs", "image-precision"
         )
-        blocks.append(Figure("image-precision", "Precision of the images", caption, f"Bar chart. {caption}", svg))
+        blocks.append(Figure("image-precision", "Precision of the images", caption, say("Bar chart. {caption}", caption=caption), svg))
     return [*blocks, DataTable("Residuals of the images", columns, tuple(rows), f"{note} {more}".strip())]
 
 

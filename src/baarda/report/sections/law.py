@@ -11,6 +11,7 @@ from baarda.report.sections._facts import result_of
 from baarda.report.sections._laws import classes_table, decision, figures, laws_table, ratios_table, scale_table, table_of_tests
 from baarda.report.sections._numbers import fixed, probability, significant
 from baarda.report.sections.base import Block, Cell, Column, DataTable, Items, Paragraph, SectionMaker, say
+from baarda.report.translation import tr
 
 
 def _moments(analysis: Analysis) -> list[Block]:
@@ -67,7 +68,7 @@ def _critical(found: CriticalValues) -> list[Block]:
         levels = (significant(c.level_w, 2), significant(c.level_tau, 2))
         rows.append((span, str(c.count), *_limit(c.w), *_limit(c.tau), *levels, *_limit(c.delta0), fixed(ratio, 2)))
     n = int((found.members >= 0).sum())
-    rows.append((f"largest of all, level {found.family_alpha:.3g}", str(n), *_limit(found.family_w), *_limit(found.family_tau), *[""] * 5))
+    rows.append((say("largest of all, level {alpha}", alpha=f"{found.family_alpha:.3g}"), str(n), *_limit(found.family_w), *_limit(found.family_tau), *[""] * 5))
     columns = (
         Column(
             "redundancy",
@@ -127,7 +128,7 @@ def _build(analysis: Analysis) -> list[Block] | None:
             level=f"{100 * study.options.interval:g}",
             low=significant(laws.interval[0], 3),
             high=significant(laws.interval[1], 3),
-            normal=", the normal law itself" if np.isinf(laws.interval[1]) else "",
+            normal=tr(", the normal law itself") if np.isinf(laws.interval[1]) else "",
         )
         blocks.append(Paragraph(text))
     if study.critical is not None:

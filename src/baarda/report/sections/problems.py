@@ -23,6 +23,7 @@ from baarda.report.sections._facts import (
 from baarda.report.sections._numbers import finer, fixed, names, plural, probability, significant
 from baarda.report.sections.base import Block, Cell, Column, DataTable, Items, Paragraph, SectionMaker, Tone, say
 from baarda.report.sections.verdict import within_chance
+from baarda.report.translation import tr
 
 Problem = tuple[Tone, str, str, str]  # tone, problem, evidence, suggestion
 
@@ -122,13 +123,17 @@ def _gathered(analysis: Analysis) -> Iterator[Problem]:
     found = clusters(analysis)
     points, images = ([c for c in found if c.kind == kind] for kind in ("point", "image"))
     if points:
-        shown = [f"{c.suspected} of {c.tested} at point {c.label}" + (f" ({c.known})" if c.known else "") for c in points]
+        shown = [
+            say("{found} of {total} at point {name}", found=c.suspected, total=c.tested, name=c.label)
+            + (f" ({tr(c.known)})" if c.known else "")
+            for c in points
+        ]
         advice = "Not single measurements but the points are in doubt: check target, identification and point number."
         if any(c.known == "fixed control" for c in points):
             advice += " Fixed control cannot yield: check its coordinates, or give them a sigma so that they are tested, too."
         yield "bad", "Suspected observations gather at few points.", names(shown, 5), advice
     if images:
-        shown = [f"{c.suspected} of {c.tested} in image {c.label}" for c in images]
+        shown = [say("{found} of {total} in image {name}", found=c.suspected, total=c.tested, name=c.label) for c in images]
         advice = "The images themselves are in doubt: movement, blur, a swapped point number that bends the orientation."
         yield "warn", "Suspected observations gather in few images.", names(shown, 5), advice
 
@@ -165,7 +170,7 @@ def _images(analysis: Analysis) -> Iterator[Problem]:
 def _correlated(analysis: Analysis) -> Iterator[Problem]:
     found = analysis.adjustment.camera_correlations()
     if found:
-        shown = [f"{bare(a, analysis)} and {bare(b, analysis)} ({fixed(r, 3)})" for a, b, r in found]
+        shown = [say("{a} and {b} ({r})", a=bare(a, analysis), b=bare(b, analysis), r=fixed(r, 3)) for a, b, r in found]
         yield (
             "warn",
             "Unknowns are hardly separable: correlations of 0.95 and more.",
@@ -209,7 +214,7 @@ def _behind(analysis: Analysis) -> Iterator[Problem]:
         yield (
             "bad",
             say("{count} behind its camera.", count=plural(len(found), "ray has its point", "rays have their points")),
-            names([f"point {p} in image {i}" for i, p in found], 6),
+            names([say("point {p} in image {i}", p=p, i=i) for i, p in found], 6),
             "The start values were wrong or the point numbers are: check these images first.",
         )
 

@@ -10,6 +10,7 @@ from baarda.report import plots
 from baarda.report.sections._facts import sensor_residuals
 from baarda.report.sections._numbers import significant
 from baarda.report.sections.base import Block, Figure, Paragraph, SectionMaker, say
+from baarda.report.translation import tr
 
 _MOST_CAMERAS = 8
 _MOST_VECTORS = 2000
@@ -39,7 +40,7 @@ def _figure(analysis: Analysis, index: int) -> Figure | None:
         at, mean, number = plots.residual_grid(xy - corner, v, size, columns)
         # n |mean|^2 / s^2 is chi-square with two degrees of freedom where nothing systematic is left.
         beyond = number * (mean**2 / (v**2).mean(axis=0)).sum(axis=1) > stats.chi2.isf(_LEVEL, 2)
-        svg, arrow = plots.vectors(at + corner, mean, beyond, frame, camera.y_down, name, "bold: differs from zero")
+        svg, arrow = plots.vectors(at + corner, mean, beyond, frame, camera.y_down, name, tr("bold: differs from zero"))
         largest = np.hypot(mean[:, 0], mean[:, 1])
         most = int(np.argmax(np.where(number >= 5, largest, -1.0)))
         caption = say(
@@ -62,7 +63,7 @@ def _figure(analysis: Analysis, index: int) -> Figure | None:
             most=significant(float(np.hypot(v[:, 0], v[:, 1]).max()), 2),
         )
     caption += " " + say("The scale arrow is {arrow:g} px long.", arrow=arrow)
-    return Figure(name, title, caption, f"Arrows over the image area. {caption}", svg)
+    return Figure(name, title, caption, say("Arrows over the image area. {caption}", caption=caption), svg)
 
 
 def _build(analysis: Analysis) -> list[Block] | None:

@@ -7,7 +7,7 @@ from importlib.metadata import version
 
 import baarda
 from baarda.procedures.testing import Analysis
-from baarda.report.sections.base import Block, Column, DataTable, SectionMaker
+from baarda.report.sections.base import Block, Column, DataTable, SectionMaker, say
 
 _MEANINGS = {
     "alpha": "level of global tests, tests of parameters, images and points",
@@ -25,7 +25,7 @@ def _build(analysis: Analysis) -> list[Block]:
     net = analysis.adjustment.network
     source = [("source", net.path or "in memory", "as typed"), ("format", net.format or "in memory", "reader that was used")]
     said = {k: ", ".join(m.name for m in v) if k == "camera_sets" else str(v) for k, v in net.settings.items()}
-    found = [(f"source: {key}", value, "setting found in the source; options win over it") for key, value in said.items()]
+    found = [(say("source: {key}", key=key), value, "setting found in the source; options win over it") for key, value in said.items()]
     options = [(key, str(value), _MEANINGS.get(key, "")) for key, value in vars(analysis.options).items()]
     columns = (Column("setting", "", "", "left"), Column("value", "", "", "left"), Column("meaning", "", "", "left"))
     software = [("baarda", baarda.__version__), ("python", platform.python_version())]

@@ -8,13 +8,14 @@ from baarda.procedures.snooping_steps import Snooping, SnoopStep
 from baarda.procedures.testing import Analysis
 from baarda.report.sections._numbers import fixed, names, plural, powers, probability, significant
 from baarda.report.sections.base import Block, Cell, Column, DataTable, Paragraph, SectionMaker, Tone, say
+from baarda.report.translation import tr
 
 _MOST = 200
 _TONES: dict[str, Tone] = {"rejected": "bad", "restored": "good", "kept": "warn"}
 
 
 def _intro(s: Snooping) -> str:
-    what = {"coordinate": "observation", "point": "image point", "image": "image"}[s.unit]
+    what = tr({"coordinate": "observation", "point": "image point", "image": "image"}[s.unit])
     start = (
         "from the least-squares adjustment" if s.start == "least squares" else say("from an adjustment under the {law} law", law=s.start)
     )
@@ -24,7 +25,7 @@ def _intro(s: Snooping) -> str:
         start=start,
         what=what,
         law=s.law or "its law",
-        alpha=f"{s.alpha:.3g}" if s.levels in ("none", "baarda") else f"{s.alpha:.3g} for the family, {s.levels}",
+        alpha=f"{s.alpha:.3g}" if s.levels in ("none", "baarda") else say("{alpha} for the family, {levels}", alpha=f"{s.alpha:.3g}", levels=s.levels),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from baarda.procedures.testing import Analysis
 from baarda.report.sections.base import Block, Cell, Column, DataTable, Paragraph, SectionMaker
+from baarda.report.translation import tr
 
 
 def _build(analysis: Analysis) -> list[Block] | None:
@@ -17,7 +18,7 @@ def _build(analysis: Analysis) -> list[Block] | None:
     )
     words = {None: "", True: "rejected: ", False: "not rejected: "}
     tones = {None: Cell(""), True: Cell("", "warn"), False: Cell("", "good")}
-    rows = tuple((s.name, Cell(words[s.rejected] + s.finding, tones[s.rejected].tone), s.decision) for s in stages)
+    rows = tuple((s.name, Cell(tr(words[s.rejected]) + s.finding, tones[s.rejected].tone), s.decision) for s in stages)
     intro = "Grün's order of an analysis: gross errors first, then the model, then the control, then the check points."
     return [Paragraph(intro), DataTable("Stages and decisions", columns, rows)]
 

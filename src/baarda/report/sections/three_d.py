@@ -33,7 +33,11 @@ def _caption(analysis: Analysis, scene: Scene) -> str:
             )
         )
     if scene.suspected:
-        parts.append(say("Lines join the images with the points that they measured under suspicion of a gross error: {count}.", count=scene.suspected))
+        parts.append(
+            say(
+                "Lines join the images with the points that they measured under suspicion of a gross error: {count}.", count=scene.suspected
+            )
+        )
         if scene.suspected > MOST_RAYS:
             parts.append(say("Of these, the {most} worst are drawn.", most=MOST_RAYS))
     if len(scene.names) < scene.total:

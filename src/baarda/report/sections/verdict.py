@@ -22,6 +22,7 @@ from baarda.report.sections._facts import (
 )
 from baarda.report.sections._numbers import column, finer, fixed, names, plural, powers, probability, significant
 from baarda.report.sections.base import Block, SectionMaker, Sentence, Tone, Verdict, say
+from baarda.report.translation import tr
 
 
 def sentences(analysis: Analysis) -> list[Sentence]:
@@ -38,7 +39,7 @@ def sentences(analysis: Analysis) -> list[Sentence]:
     """
     if not analysis.converged:
         return [_not_converged(analysis)]
-    parts = (_adjusted, _variance_factor, _parameters, _suspected, _hidden, _precision, _points, _law)
+    parts = (_adjusted, _likelihood, _variance_factor, _parameters, _suspected, _hidden, _precision, _points, _law)
     return [s for s in (part(analysis) for part in parts) if s is not None]
 
 
@@ -70,6 +71,14 @@ def _adjusted(analysis: Analysis) -> Sentence:
         share=fixed(a.redundancy / a.count, 2),
     )
     return Sentence("Adjustment", text, "good", "data")
+
+
+def _likelihood(analysis: Analysis) -> Sentence | None:
+    """Say which law of errors the adjustment took, and what it resists: under a law most tests do not apply."""
+    law = analysis.adjustment.law
+    if law is None:
+        return None
+    return Sentence("Law of errors", f"{law.assumptions[0]} {law.assumptions[2]}", "warn", "data")
 
 
 def _variance_factor(analysis: Analysis) -> Sentence | None:
@@ -164,7 +173,11 @@ def _suspected(analysis: Analysis) -> Sentence | None:
     if gathered:
         share = sum(c.suspected for c in gathered)
         where = names([c.label for c in gathered], 5)
-        text += " " + say("{count} of them gather at {points}.", count=share, points=f"point{'s' if len(gathered) > 1 else ''} {where}")
+        text += " " + say(
+            "{count} of them gather at {points}.",
+            count=share,
+            points=say("points {names}" if len(gathered) > 1 else "point {names}", names=where),
+        )
     return Sentence("Gross errors", text, "warn" if within_chance(analysis) else "bad", "suspected")
 
 
@@ -183,9 +196,9 @@ def _hidden(analysis: Analysis) -> Sentence | None:
     if result_of(analysis, "data_snooping") is None:
         return None
     rows = np.flatnonzero(image_rows(analysis))
-    what = "image coordinate"
+    what = tr("image coordinate")
     if not len(rows):
-        rows, what = np.arange(analysis.adjustment.count), "observation"
+        rows, what = np.arange(analysis.adjustment.count), tr("observation")
     bias = analysis.observations["mdb"]
     lost = int(np.isnan(analysis.w).sum())
     rows = rows[np.isfinite(bias[rows])]
@@ -300,7 +313,7 @@ def _check(analysis: Analysis) -> tuple[str, Tone] | None:
         limit=fixed(_upper(joint.critical), 2),
         rms=significant(rms * factor, 3),
         unit=unit,
-        names=names(wrong, 5) or "none",
+        names=names(wrong, 5) or tr("none"),
     )
     return text, tone
 
@@ -325,7 +338,7 @@ def _control(analysis: Analysis) -> tuple[str, Tone] | None:
         template = "The weighted control contradicts its sigmas (T = {t}, limit {limit}), though none of {count} points singly."
     else:
         template = "The weighted control agrees with its sigmas (T = {t}, limit {limit}; {wrong} of {count} points rejected singly{more})."
-    more = ", more than chance rejects" if many else ""
+    more = tr(", more than chance rejects") if many else ""
     return say(template, worst=wrong[0] if wrong else "", more=more, **fields), tone
 
 
@@ -355,18 +368,23 @@ def _law(analysis: Analysis) -> Sentence | None:
             limit=fixed(_upper(simulated.critical), 2),
             p=_p_word(float(simulated.p_value)),
         )
+    more = ""
     if not rejected:
         text = "The residuals do not contradict normal errors ({test})."
         if best.law != "normal":
-            text += " The {best} has the better AIC, but not by enough to reject the normal law."
+            more = " The {best} has the better AIC, but not by enough to reject the normal law."
     elif best.law == "normal":
         text = "The residuals are not those of normal errors ({test}); no other law tried fits them better."
-    else:
-        text = "The residuals are not those of normal errors ({test}); of the laws tried the {best} fits best by AIC" + (
-            ", though its chi-square rejects it too." if best.rejected else "."
+    elif best.rejected:
+        text = (
+            "The residuals are not those of normal errors ({test}); of the laws tried the {best} fits best by AIC, though its chi-square "
+            "rejects it too."
         )
+    else:
+        text = "The residuals are not those of normal errors ({test}); of the laws tried the {best} fits best by AIC."
     tone: Tone = "warn" if rejected else "good"
-    return Sentence("Law of residuals", say(text, test=test, best=law_name(best.law, best.parameters.get("a"))), tone, "law")
+    name = law_name(best.law, best.parameters.get("a"))
+    return Sentence("Law of residuals", say(text, test=test, best=name) + (say(more, best=name) if more else ""), tone, "law")
 
 
 def _p_word(p: float | None) -> str:
@@ -382,8 +400,10 @@ def law_name(law: str, a: float | None = None) -> str:
     >>> law_name("modulated_normal", -0.143), law_name("radico", 0.5)
     ('modulated normal law (a = -0.14)', 'radico law')
     """
-    words = law.replace("_", " ")
-    return f"{words} law (a = {significant(a, 2)})" if law == "modulated_normal" and a is not None else f"{words} law"
+    words = tr(law.replace("_", " "))
+    if law == "modulated_normal" and a is not None:
+        return say("{law} law (a = {a})", law=words, a=significant(a, 2))
+    return say("{law} law", law=words)
 
 
 def _build(analysis: Analysis) -> list[Block]:

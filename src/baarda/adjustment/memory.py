@@ -1,0 +1,89 @@
+"""How much memory an adjustment will take, told before it begins, and a refusal where it cannot fit."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from baarda.adjustment.structure import Structure
+from baarda.errors import NotEnoughMemory
+from baarda.network import Unknowns
+from baarda.observations import Kind
+
+DOUBLE = 8
+TOLD_FROM = 0.5e9  # bytes
+
+
+def available() -> float:
+    """Return the bytes that this process may still take, of the machine or its control group; infinite where the system tells nothing."""
+    found = [np.inf]
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                found.append(1024.0 * float(line.split()[1]))
+    except (OSError, ValueError):
+        if hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
+            found.append(float(os.sysconf("SC_AVPHYS_PAGES")) * float(os.sysconf("SC_PAGE_SIZE")))
+    try:
+        group = Path("/sys/fs/cgroup")
+        limit, used = (group / name for name in ("memory.max", "memory.current"))
+        found.append(float(limit.read_text(encoding="ascii")) - float(used.read_text(encoding="ascii")))
+    except (OSError, ValueError):  # "max", or no control group
+        pass
+    return min(found)
+
+
+def of_rows(unknowns: Unknowns, groups: Sequence[Kind]) -> float:
+    """Return the bytes of partials, misclosures, nodes and results of all observations.
+
+    Parameters
+    ----------
+    unknowns : Unknowns
+    groups : sequence of Kind
+    """
+    camera = unknowns["camera"]
+    widths = np.diff(camera.offsets)
+    free = [(camera.columns[a:b] >= 0).sum() for a, b in zip(camera.offsets[:-1], camera.offsets[1:], strict=True)]
+    width = 9 + (int(max(free)) if len(widths) else 0)
+    scalars = sum(len(g) * len(g.components) for g in groups)
+    return float(DOUBLE * scalars * (width + 12) + DOUBLE * unknowns.count * 12)
+
+
+def of_dense(unknowns: Unknowns) -> float:
+    """Return the bytes of the dense solver: normal matrix, factor and inverse."""
+    return 4.0 * DOUBLE * unknowns.count**2
+
+
+def of_fronts(structure: Structure) -> float:
+    """Return the bytes of the factor, and of the largest fronts that are held at a time."""
+    sizes = np.array([len(f.columns) for f in structure.fronts], dtype=float)
+    pivots = np.array([f.pivots for f in structure.fronts], dtype=float)
+    if not len(sizes):
+        return 0.0
+    waiting = np.sort((sizes - pivots) ** 2)[::-1]
+    depth = int(np.ceil(np.log2(len(sizes) + 1))) + 2
+    return float(DOUBLE * ((sizes * pivots).sum() + (pivots**2).sum() + 3.0 * sizes.max() ** 2 + 2.0 * waiting[:depth].sum()))
+
+
+def check(needed: float, what: str, tell: Callable[[str], None] | None) -> None:
+    """Tell the estimate where it is large; refuse where it exceeds what there is.
+
+    Raises
+    ------
+    NotEnoughMemory
+
+    Examples
+    --------
+    >>> check(1e18, "the factor", None)  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    ...
+    baarda.errors.NotEnoughMemory: the factor need(s) about 1000000000.0 GB of memory; ... GB are available
+    """
+    there = available()
+    if needed > there:
+        raise NotEnoughMemory(f"{what} need(s) about {needed / 1e9:.1f} GB of memory; {there / 1e9:.1f} GB are available")
+    if tell is not None and needed >= TOLD_FROM:
+        tell(f"{what}: about {needed / 1e9:.1f} GB of memory")
