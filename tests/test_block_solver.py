@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy import linalg
+from threadpoolctl import threadpool_limits
 
 import baarda
 from baarda import cameras
@@ -30,6 +31,13 @@ from networks import with_distances
 
 SWITCHES = (kernels, vector_loops, image_kernels)
 EPS = np.finfo(float).eps
+
+
+@pytest.fixture(autouse=True)
+def one_thread_for_blas():
+    """The oracles are small; threads of theirs only stand in each other's way."""
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
 
 
 @pytest.fixture(params=["twins", "compiled"])
@@ -69,13 +77,13 @@ def partly_fixed(network):
     return replace(network, points=replace(network.points, states=states))
 
 
-def in_all_images(images=25):
+def in_all_images(images=15):
     """One point in every image, the others in three neighbours each: a row of the reduced system that joins everything."""
     rng = np.random.default_rng(5)
-    network = made("ring", images=images, points=120)
+    network = made("ring", images=images, points=80)
     group = network.observations[0]
     control = network.points.roles[group.points] == CONTROL
-    first = rng.integers(0, images, 120)
+    first = rng.integers(0, images, 80)
     near = (group.images - first[group.points]) % images < 4
     return replace(network, observations=(group.selected(near | (group.points == 7) | control), *network.observations[1:]))
 
@@ -166,19 +174,19 @@ def disconnected(control_of_second):
 
 
 NETWORKS = {
-    "aerial": lambda: made("aerial", images=9, points=150),
-    "aerial, corrects": lambda: made("aerial", images=9, points=120, model="brown"),
-    "aerial, two distances": lambda: made("aerial", images=9, points=120, model="OPENCV", per_image_cameras=True),
+    "aerial": lambda: made("aerial", images=9, points=100),
+    "aerial, corrects": lambda: made("aerial", images=9, points=90, model="brown"),
+    "aerial, two distances": lambda: made("aerial", images=9, points=90, model="OPENCV", per_image_cameras=True),
     "ring, free": lambda: made("ring", images=6, points=40, control=0),
     "long tracks": lambda: made("long-tracks", images=12, points=90),
-    "dense": lambda: made("dense", images=12, points=150),
-    "per-image cameras": lambda: made("aerial", images=9, points=150, per_image_cameras=True),
-    "fixed control": lambda: made("aerial", images=9, points=120, control_sigma=0.0),
+    "dense": lambda: made("dense", images=12, points=90),
+    "per-image cameras": lambda: made("aerial", images=9, points=100, per_image_cameras=True),
+    "fixed control": lambda: made("aerial", images=9, points=90, control_sigma=0.0),
     "correlated": lambda: correlated(made("ring", images=6, points=40)),
     "partly fixed": lambda: partly_fixed(made("ring", images=6, points=40)),
     "a point in all images": in_all_images,
     "chain": lambda: chain(12, 90),
-    "joined points": lambda: joined_points(made("aerial", images=9, points=120)),
+    "joined points": lambda: joined_points(made("aerial", images=9, points=90)),
     "single rays": lambda: single_rays(made("ring", images=6, points=40)),
     "correlated control": lambda: correlated_control(made("ring", images=6, points=40)),
     "two models": lambda: two_models(made("ring", images=8, points=40)),
@@ -348,10 +356,10 @@ def test_products_with_the_design_matrix(name, loops):
 
 # ---- larger systems against the dense solver ----
 LARGE = {
-    "aerial": lambda: made("aerial", images=25, points=1400),
-    "long tracks": lambda: made("long-tracks", images=40, points=700),
-    "dense": lambda: made("dense", images=40, points=900),
-    "per-image cameras": lambda: made("aerial", images=36, points=900, per_image_cameras=True),
+    "aerial": lambda: made("aerial", images=25, points=900),
+    "long tracks": lambda: made("long-tracks", images=30, points=650),
+    "dense": lambda: made("dense", images=30, points=700),
+    "per-image cameras": lambda: made("aerial", images=36, points=650, per_image_cameras=True),
 }
 
 
@@ -408,7 +416,7 @@ def cut_out(network, images):
 
 def test_camera_complete_cut_out_of_a_large_block(monkeypatch):
     monkeypatch.setattr(kernels, "COMPILE_FROM", 0)
-    block = made("aerial", images=100, points=5000)
+    block = made("aerial", images=100, points=4000)
     across = 10
     centre = [r * across + c for r in range(4, 8) for c in range(4, 8)]
     s = system(cut_out(block, centre))
@@ -421,9 +429,9 @@ def test_cut_out_of_real_images(data, monkeypatch):
     network = baarda.formats.read(data("bal_dubrovnik16") / "problem-16-22106-pre.txt")
     group = network.observations[0]
     rng = np.random.default_rng(2)
-    chosen = rng.choice(len(network.points.labels), 1500, replace=False)
+    chosen = rng.choice(len(network.points.labels), 1100, replace=False)
     s = system(cut_out(replace(network, observations=(group.selected(np.isin(group.points, chosen)),)), np.arange(16)))
-    assert 3000 < s.lin.unknowns.count <= 5000
+    assert 2000 < s.lin.unknowns.count <= 5000
     for compile_from in (0, 10**9):
         for module in SWITCHES:
             monkeypatch.setattr(module, "COMPILE_FROM", compile_from)
@@ -589,7 +597,7 @@ from baarda.procedures.synthetic import synthetic
 for module in (kernels, vector_loops, image_kernels):
     module.COMPILE_FROM = 0
     assert module.compiled() is None
-r = baarda.adjust(synthetic("aerial", images=9, points=150, seed=3).network, solver="block")
+r = baarda.adjust(synthetic("aerial", images=9, points=100, seed=3).network, solver="block")
 assert r.status == "converged"
 assert abs(r.redundancy_numbers.sum() / r.redundancy - 1.0) < 1e-9
 print(repr(r.objective))

@@ -1,5 +1,7 @@
 """The report: what it says of real blocks, and that names from strangers, missing parts and a second run do no harm."""
 
+import base64
+import hashlib
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -158,10 +160,10 @@ def test_not_converged_says_so_and_tests_nothing():
 
 
 def test_sections_come_in_order_and_vanish(calibration, aerial):
-    ids = ["verdict", "problems", "data", "groups", "cameras", "collinearity", "images", "points", "suspected", "check-control", "tests"]
-    ids += ["law", "residual-vectors", "network-plan", "settings"]
+    ids = ["verdict", "problems", "data", "groups", "cameras", "collinearity", "images", "points", "suspected", "check-control"]
+    ids += ["accuracy-statement", "tests", "law", "residual-vectors", "reliability-maps", "network-plan", "space", "settings"]
     assert [s.id for s in page.sections(aerial)] == [i for i in ids if i != "collinearity"]  # no camera parameter is estimated
-    assert [s.id for s in page.sections(calibration)] == [i for i in ids if i != "check-control"]
+    assert [s.id for s in page.sections(calibration)] == [i for i in ids if i not in ("check-control", "accuracy-statement")]
 
 
 def test_suspected_observations_gather_at_the_control_points(calibration):
@@ -233,7 +235,14 @@ def test_page_loads_nothing(pages):
     read = Page(text)
     csp = next(a["content"] for a in read.named("meta") if a.get("http-equiv") == "Content-Security-Policy")
     assert csp.startswith("default-src 'none'; style-src 'unsafe-inline'; img-src data:")
-    assert not {tag for tag, _ in read.elements} & {"script", "link", "iframe", "object", "embed", "img", "base", "form", "video", "audio"}
+    scripts = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
+    if scripts:  # one, the viewer, and the page allows no other
+        digest = base64.b64encode(hashlib.sha256(scripts[0].encode()).digest()).decode()
+        assert len(scripts) == 1 and f"script-src 'sha256-{digest}';" in csp
+    else:
+        assert "script-src" not in csp
+    assert all(a in ({}, {"type": "application/json"}) for a in read.named("script"))
+    assert not {tag for tag, _ in read.elements} & {"link", "iframe", "object", "embed", "img", "base", "form", "video", "audio"}
     for tag, attributes in read.elements:
         for key, value in attributes.items():
             assert not key.startswith("on"), (tag, key)
@@ -253,6 +262,7 @@ def test_page_is_accessible(pages):
     _, made, text = pages
     read = Page(text)
     drawings = [a for a in read.named("svg") if a.get("role") == "img"]
+    assert all(a["tabindex"] == "0" and a["role"] == "img" and len(a["aria-label"]) > 40 for a in read.named("canvas"))
     assert len(drawings) == len(read.named("svg")) == sum(isinstance(b, Figure) for s in made for b in s.blocks)
     assert all(len(a["aria-label"]) > 40 for a in drawings)
     assert len(read.named("caption")) == len(read.named("table"))
@@ -286,7 +296,7 @@ def test_hostile_names_stay_names(hostile):
     for name in ("<script>alert(1)</script>0", "$x^2$1", '"onload="x2', "a&b3", "{{7*7}}4", "]]>-->5"):
         assert name in words, name
     assert "<img src=x onerror=alert(1)>" in words and "<b>$\\alpha$</b>" in words
-    assert "<script" not in text and "<img" not in text and "<b>$" not in text
+    assert text.count("<script") == 2 and "<script>alert" not in text and "<img" not in text and "<b>$" not in text
     for hidden in ("\x1b", "\u202e"):
         assert hidden not in text and hidden not in page.text(made) and hidden not in " ".join(page.verdict(hostile))
     plan = page.figures(made)["network-plan"]
@@ -363,3 +373,33 @@ def test_vectors_are_drawn_to_scale():
     at, v = np.array([[100.0, 100.0], [300.0, 100.0]]), np.array([[1.0, 0.0], [0.0, 2.0]])
     svg, arrow = plots.vectors(at, v, [False, False], (0.0, 400.0, 0.0, 200.0), True, "v")
     assert arrow in (1.0, 2.0) and f">{arrow:g} px</text>" in svg
+
+
+# ---- contrast --------------------------------------------------------------------------------------------------------------------------
+
+
+def luminance(colour):
+    """Relative luminance of #rrggbb (WCAG 2.2)."""
+    parts = [int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5)]
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+@pytest.mark.parametrize("scheme", [0, 1, 2], ids=["light", "dark", "print"])
+def test_colours_have_the_contrast_that_reading_needs(scheme, calibration):
+    """At least 4.5 for text, 3 for graphics (WCAG 2.2, 1.4.3 and 1.4.11)."""
+    text = page.html(calibration, [])
+    block = re.findall(r":root \{(.*?)\}", text, re.DOTALL)[scheme]
+    colours = dict(re.findall(r"--([a-z-]+): (#[0-9a-f]{6})", block))
+
+    def contrast(a, b):
+        light, dark = sorted((luminance(colours[a]), luminance(colours[b])), reverse=True)
+        return (light + 0.05) / (dark + 0.05)
+
+    for ink in ("ink", "muted", "link"):
+        assert contrast(ink, "paper") >= 4.5, ink
+        assert contrast(ink, "panel") >= 4.5, ink
+    for tone in ("good", "warn", "bad", "info"):
+        assert contrast(tone, f"{tone}-paper") >= 4.5, tone
+    for line in ("blue", "orange", "green"):
+        assert contrast(line, "paper") >= 3.0, line

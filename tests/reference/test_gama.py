@@ -243,7 +243,7 @@ def test_project_folders_give_the_network_back(data, tmp_path, name):
     [
         ("declared", "station,2,", "tower,2,", 3, "'tower' are not known"),
         ("declared", "station,2,", "station,1,", 3, "orientation of station '1' appears twice"),
-        ("declared", ",free", ",observed", 2, "fixed or free"),
+        ("declared", ",free", ",observed", 2, "an observed unknown needs a given value and a sigma"),
         ("directions", "\n1,1,2,", "\n77,1,2,", 2, "station '77'"),
         ("directions", "\n1,1,2,", "\n1,1,1,", 2, "must be different"),
         ("directions", "\n1,1,2,0.0,1.57", "\n1,1,2,0.0,-1.57", 2, "sigma"),

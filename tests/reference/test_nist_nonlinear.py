@@ -11,8 +11,8 @@ from baarda.errors import Singular
 from baarda.network import Declared, Images, Network, Points
 from baarda.observations.base import Block, Rows
 
-# Starts from which the adjustment does not arrive. At MGH09's first start the curve hardly depends on the sizes of its parameters: b1 and b2
-# grow against each other in a flat valley that falls to 9.4E-04, three times the certified sum); at MGH17's first start the exponentials
+# Starts from which the adjustment does not arrive. At MGH09's first start the curve hardly depends on the sizes of its parameters: b1 and
+# b2 grow against each other in a flat valley that falls to 9.4E-04, three times the certified sum; at MGH17's first start the exponentials
 # have died away at the second abscissa already, so that columns of the design matrix differ by rounding alone (condition 4e13).
 ASTRAY = {("MGH09", 1): ("b1", "b2"), ("MGH17", 1): ("b2", "b3")}
 MISPRINTED = {("Roszman1", 0): 0.20196866396}  # the file says 1.20196866396E-0, a sum of squares of 25 instead of the certified 4.9E-04

@@ -225,23 +225,24 @@ def test_size_and_power_of_variance_components_in_a_linear_model():
     forms = (member @ (rest @ errors) ** 2).T
     assert_sizes([np.asarray(variance_component(q, traces, names).p_value) for q in forms])
     assert_sizes([equal_variance_components(q, traces, names).p_value for q in forms])
-    wrong = errors * np.where(codes == 1, 1.25, 1.0)[:, None]
-    forms = (member @ (rest @ wrong) ** 2).T
+    scales = np.where(codes == 1, 1.25, 1.0)
+    forms = (member @ (rest @ (errors * scales[:, None])) ** 2).T
     single = np.array([np.asarray(variance_component(q, traces, names).rejected) for q in forms])
     equal = np.mean([equal_variance_components(q, traces, names).rejected for q in forms])
-    # The form of group b is close to its chi-square times the true factor, the part from the other groups unchanged.
-    block = rest[np.ix_(codes == 1, codes == 1)]
-    mean = 1.25**2 * traces[1, 1] + traces[1, 0] + traces[1, 2]
-    spread = 2.0 * (
-        1.25**4 * float((block @ block * (block @ block)).sum()) + 2.0 * 1.25**2 * float((rest[codes == 1][:, codes != 1] ** 2 * 1.0).sum())
-    )
-    law = stats.chi2(traces[1].sum() ** 2 / traces[1, 1])
-    f = float(law.args[0])
-    own = stats.chi2(2.0 * mean**2 / spread, scale=spread / (2.0 * mean))
-    expected = own.sf(law.ppf(0.975) / f * traces[1].sum()) + own.cdf(law.ppf(0.025) / f * traces[1].sum())
-    assert abs(single[:, 1].mean() - expected) < 0.03
-    assert single[:, 1].mean() > 0.7
-    assert equal > 0.7
+    # Mean and variance of each form e'M_i e of errors of variances D are tr(M_i D) and 2 tr(M_i D M_i D).
+    weighted = [rest[:, codes == i] @ rest[codes == i] * scales**2 for i in range(3)]
+    mean = np.array([np.trace(m) for m in weighted])
+    spread = 2.0 * np.einsum("ij,ji->", weighted[1], weighted[1])
+    r = traces.sum(axis=1)
+    f = r[1] ** 2 / traces[1, 1]
+    own = stats.chi2(2.0 * mean[1] ** 2 / spread, scale=spread / (2.0 * mean[1]))
+    low, high = stats.chi2(f).ppf([0.025, 0.975]) * r[1] / f
+    assert abs(single[:, 1].mean() - (own.sf(high) + own.cdf(low))) < 0.02
+    shift = np.log(mean / r)
+    v = 2.0 * traces / np.outer(r, r)
+    c = np.eye(3)[1:] - np.eye(3)[:1]
+    lam = c @ shift @ np.linalg.solve(c @ v @ c.T, c @ shift)
+    assert abs(equal - power_of_test(lam, 0.05, 2)) < 0.06  # the covariance of the logarithms is that of the null
     assert single[:, [0, 2]].mean() < 0.10
 
 

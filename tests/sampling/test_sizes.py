@@ -22,7 +22,6 @@ from baarda.hypotheses import (
     image_points,
     moments,
     run,
-    variance_factor,
 )
 from baarda.hypotheses import deformation as deformation_test
 from baarda.hypotheses.base import Evidence

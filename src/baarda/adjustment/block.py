@@ -9,9 +9,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,8 +109,13 @@ class BlockSolver:
         if bad.any():
             _refuse_points(lin, structure.point_columns[bad])
         if weak:
-            _refuse_nodes(lin, structure, inverse, arrays, loops, size, diagonal, *min(weak, key=lambda w: w[0]))
+            _refuse_nodes(lin, structure, inverse, arrays, loops, size, diagonal, *min(weak, key=lambda w: (not w[2], w[0])))
         return BlockSolver(lin, structure, inverse, arrays, loops, triangles, tuple(p for p in panels if p is not None), size)
+
+    def at(self, lin: Linearization | None) -> BlockSolver:
+        """Return this factor for the system at a state nearby, as an approximate one; None only lets the old system go."""
+        values = self.blocks_.values[:0] if lin is None else lin.values
+        return replace(self, lin=cast(Linearization, lin), blocks_=self.blocks_._replace(values=values))
 
     @property
     def count(self) -> int:

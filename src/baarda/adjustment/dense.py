@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,10 @@ class DenseSolver:
         normal = (lin.design.T @ lin.design).toarray()[np.ix_(kept, kept)] / np.outer(scale, scale)
         factor, rcond = factorise(normal + damping * np.eye(len(kept)), [kept], lin)
         return DenseSolver(lin, kept, factor, scale, rcond)
+
+    def at(self, lin: Linearization | None) -> DenseSolver:
+        """Return this factor for the system at a state nearby, as an approximate one; None only lets the old system go."""
+        return replace(self, lin=cast(Linearization, lin))
 
     def solve(self, rhs: Floats) -> Floats:
         """Return N^-1 rhs for (u,) or (u, k) right-hand sides; held unknowns stay zero."""

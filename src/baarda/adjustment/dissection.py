@@ -35,8 +35,9 @@ def dissect(graph: Any, coordinates: Floats | None = None, leaf: int = LEAF) -> 
 
     Notes
     -----
-    Each half is cut off by the smallest vertex cover of the edges between the halves (König's theorem on a maximum matching). A part whose
-    separator would be nearly as large as its smaller side is left whole: its fronts are dense anyway.
+    Nodes joined to more than half of the others come last. Each half is cut off by the smallest vertex cover of the edges between the
+    halves (König's theorem on a maximum matching). A part whose separator would be nearly as large as its smaller side is left whole:
+    its fronts are dense anyway.
 
     Examples
     --------
@@ -50,7 +51,10 @@ def dissect(graph: Any, coordinates: Floats | None = None, leaf: int = LEAF) -> 
     places = np.full((n, 0), np.nan) if coordinates is None else np.asarray(coordinates, dtype=float)
     if n and not np.isfinite(places).all():
         places = np.zeros((n, 0))
-    return [part for part in _parts(graph, places, np.arange(n), leaf) if len(part)]
+    hub = np.diff(graph.indptr) > max(leaf, n // 2)  # joined to most others, as a camera of all images is: eliminated last
+    if n and hub.all():
+        return [np.arange(n)]
+    return [part for part in (*_parts(graph, places, np.flatnonzero(~hub), leaf), np.flatnonzero(hub)) if len(part)]
 
 
 def _parts(graph: Any, places: Floats, nodes: Ints, leaf: int) -> Iterator[Ints]:

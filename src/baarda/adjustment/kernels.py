@@ -240,7 +240,7 @@ def _statistics(clusters: Ints, z: Floats, b: Blocks, hat: Floats, points: Float
     product = np.empty(size[1])
     square = np.empty(size[2])
     stack = np.empty(size[3], np.int64)
-    mixed = np.empty((3, 8))
+    mixed = np.empty((3, size[0]))
     for c in clusters:
         first, last = b.first_point[c], b.first_point[c + 1]
         offset = b.first_column[c]
@@ -497,8 +497,8 @@ def _statistics_twin(clusters: Ints, z: Floats, b: Blocks, hat: Floats, points: 
         local[:width, :width] = z[np.ix_(rows, rows)]
         t = np.zeros((len(y), width + 1))
         t[:, :width] = y @ local[:width, :width]
-        cube = t.reshape(-1, 3, width + 1)
-        core = np.eye(3) + cube[:, :, :width] @ y.reshape(-1, 3, width).transpose(0, 2, 1)
+        cube = t.reshape(len(t) // 3, 3, width + 1)
+        core = np.eye(3) + cube[:, :, :width] @ y.reshape(len(y) // 3, 3, width).transpose(0, 2, 1)
         inner = np.linalg.solve(r, np.broadcast_to(np.eye(3), r.shape))
         scale = b.point_inverse[some]
         points[some] = inner @ core @ inner.transpose(0, 2, 1) * scale[:, :, None] * scale[:, None, :]
@@ -538,16 +538,17 @@ def compiled() -> Kernels | None:
     except ImportError:
         return None
 
+    original = getattr(_factor_point, "py_func", _factor_point)
+
     def build(cached: bool) -> Kernels:
+        global _factor_point
         jit = numba.njit(nogil=True, cache=cached, error_model="numpy")
+        _factor_point = jit(original)
         scope: dict[str, Any] = {}
         for function in (_accumulate, _statistics, _extend, _gather):
             scope[function.__name__] = jit(function)
         return Kernels(scope["_accumulate"], scope["_statistics"], scope["_extend"], scope["_gather"], compiled=True)
 
-    global _factor_point
-    if not hasattr(_factor_point, "py_func"):
-        _factor_point = numba.njit(nogil=True, cache=True, error_model="numpy")(_factor_point)
     try:
         return build(cached=True)
     except RuntimeError:  # no place to write the cache

@@ -201,6 +201,8 @@ class Linearization:
         """Return A x for (u,) or (u, k) vectors; with `kinds` only of the parts of these unknown groups."""
         if x.ndim == 2 and self.count <= FEW and kinds is None:
             return np.asarray(self.design @ x)
+        if x.ndim == 2 and x.shape[1] == 1:
+            return self.times(x[:, 0], kinds)[:, None]
         padded = np.concatenate([x, np.zeros((1, *x.shape[1:]))])
         out = np.zeros((self.count, *x.shape[1:]))
         loops = vector_loops(self.count)
@@ -231,6 +233,8 @@ class Linearization:
         """Return A' y for (n,) or (n, k) vectors; with `kinds` only the rows of these unknown groups, the others zero."""
         if y.ndim == 2 and self.count <= FEW and kinds is None:
             return np.asarray(self.design.T @ y)
+        if y.ndim == 2 and y.shape[1] == 1:
+            return self.transposed(y[:, 0], kinds)[:, None]
         return self._gathered(y, kinds, squared=False)
 
     def column_sums(self, weights: Floats) -> Floats:
@@ -307,7 +311,8 @@ def linearize(
                 by_width.setdefault(piece.width, []).append(piece)
             for pieces in by_width.values():
                 rows = group.linearize_piece(network, state, pieces[0])
-                later = [(len(p.rows), partial(group.linearize_piece, network, state, p)) for p in pieces[1:]]
+                evaluate, fill = (partial(f, network, state) for f in (group.linearize_piece, group.fill))
+                later = [_Later(len(p.rows), group.images_of(network, p), partial(evaluate, p), partial(fill, p)) for p in pieces[1:]]
                 where = np.concatenate([first[p.rows] for p in pieces])
                 fillings.append(_Filling.of(rows, later, where, unknowns, kept, group.name))
         else:
@@ -332,6 +337,19 @@ def kept_positions(unknowns: Unknowns) -> dict[tuple[str, int], Ints]:
     return out
 
 
+@dataclass(frozen=True)
+class _Later:
+    """A piece: its number of row blocks, its images in words, what computes it, and what may write it straight into a chunk.
+
+    The latter returns the sigmas, or None where it cannot.
+    """
+
+    count: int
+    name: str
+    compute: Callable[[], Rows]
+    fill: Callable[..., Floats | None]
+
+
 @dataclass
 class _Filling:
     """A chunk that is filled piece by piece."""
@@ -339,7 +357,7 @@ class _Filling:
     name: str
     first: Ints
     rows: list[Rows]
-    later: list[tuple[int, Callable[[], Rows]]]
+    later: list[_Later]
     groups: list[tuple[UnknownGroup, Ints]]
     misclosure: Floats
     parts: list[Part]
@@ -367,9 +385,26 @@ class _Filling:
             start += size
         rows = self.rows.pop()
         self._put(0, rows)
-        starts = np.cumsum([len(rows.index), *(count for count, _ in self.later)])
-        for _ in for_each(range(len(self.later)), lambda i: self._put(int(starts[i]), self.later[i][1]()), workers):
+        starts = np.cumsum([len(rows.index), *(piece.count for piece in self.later)])
+        for _ in for_each(range(len(self.later)), lambda i: self._add(int(starts[i]), self.later[i]), workers):
             pass
+
+    def _add(self, start: int, piece: _Later) -> None:
+        """Let a piece write its rows where they belong, or store what it computes."""
+        try:
+            self._take(start, piece)
+        except Exception as error:
+            error.add_note(f"{self.name}: {piece.name}")
+            raise
+
+    def _take(self, start: int, piece: _Later) -> None:
+        some = slice(start, start + piece.count)
+        parts = [(p.positions, p.nodes[some], p.jacobian[some]) for p in self.parts]
+        sigma = piece.fill(self.misclosure[some], parts)
+        if sigma is None:
+            self._put(start, piece.compute())
+        else:
+            self.factors[start] = _diagonal(sigma)
 
     def _put(self, start: int, rows: Rows) -> None:
         """Whiten and store the row blocks of a piece."""
@@ -437,15 +472,20 @@ def _factor(cofactor: Floats, name: str) -> tuple[Floats, Floats]:
         sigma = np.sqrt(cofactor if cofactor.ndim == 2 else np.einsum("nii->ni", cofactor))
         if not np.all(sigma > 0.0):
             raise InputError(f"{name}: a cofactor matrix is not positive definite (a sigma of zero)")
-        same = len(sigma) > 0 and bool(np.all(sigma == sigma[0]))
-        factor = np.zeros((1 if same else len(sigma), m, m))
-        np.einsum("nii->ni", factor)[...] = sigma[: len(factor)]
-        return factor, 1.0 / sigma
+        return _diagonal(sigma), 1.0 / sigma
     try:
         factor = np.asarray(np.linalg.cholesky(cofactor), dtype=float)
     except np.linalg.LinAlgError:
         raise InputError(f"{name}: a cofactor matrix is not positive definite (correlation beyond 1, or a sigma of zero)") from None
     return factor, np.asarray(np.linalg.inv(factor), dtype=float)
+
+
+def _diagonal(sigma: Floats) -> Floats:
+    """Return the factors (N, m, m) of uncorrelated rows; (1, m, m) where all are equal."""
+    same = len(sigma) > 0 and bool(np.all(sigma == sigma[0]))
+    factor = np.zeros((1 if same else len(sigma), sigma.shape[1], sigma.shape[1]))
+    np.einsum("nii->ni", factor)[...] = sigma[: len(factor)]
+    return factor
 
 
 def _apply(whiten: Floats, array: Floats) -> Floats:

@@ -20,7 +20,7 @@ from baarda.adjustment.linearize import Arrangement, Linearization, check_finite
 from baarda.adjustment.result import Adjustment, Iteration
 from baarda.adjustment.robust import adjust_under_law, check_law
 from baarda.adjustment.solver import Solver
-from baarda.adjustment.structure import analyse, inner_points, rank_of_points
+from baarda.adjustment.structure import analyse, inner_points, rank_for
 from baarda.cameras import FREE
 from baarda.errors import DatumDefect, RedundancyNotPositive, UsageError
 from baarda.network import CHECK, Network, State, Unknowns, unknowns_of
@@ -28,6 +28,8 @@ from baarda.observations import ImagePoints, Kind, direct_observations
 
 Floats = NDArray[np.float64]
 DENSE_LIMIT = 1500
+REUSE = 1e-4  # relative step below which the factor of the last iteration serves the next ones
+NEAR = 1e-3  # relative step below which a full step is not tried before it is taken
 BEND = 1e-7  # relative step above which steps are bent
 
 
@@ -155,7 +157,7 @@ def _adjust(network: Network, settings: Settings) -> Adjustment:
     memory.check(
         memory.of_rows(unknowns, groups) + (memory.of_dense(unknowns) if kind == "dense" else 0.0), "the observations", settings.tell
     )
-    rank = rank_of_points(start.points)
+    rank = rank_for(groups, start.points)
     arranged = Arrangement.of(groups, rank if kind == "block" else None)
     lin = linearize(prepared, start, unknowns, arranged, settings.jobs)
     check_finite(lin, groups, prepared)
@@ -179,7 +181,9 @@ def _adjust(network: Network, settings: Settings) -> Adjustment:
         return BlockSolver.of(lin, structure, datum.held, damping)
 
     datum = choose_datum(defect, lin, settings, prepared)
-    state, lin, history, converged = _iterate(prepared, start, lin, arranged, datum, factor, settings)
+    given = [lin]
+    del lin  # so that the iteration can let it go
+    state, lin, history, converged = _iterate(prepared, start, given.pop(), arranged, datum, factor, settings)
     law = None
     if settings.robust is not None:
         found = adjust_under_law(prepared, state, lin, arranged, datum, factor, settings, redundancy, history)
@@ -344,16 +348,24 @@ def _iterate(
     stalled = 0
     before: Floats | None = None  # the last full step, as a change of the observations
 
-    def misclosures(step: Floats) -> tuple[State, Floats, float]:
-        trial = state.moved(lin.unknowns, step, centres_of_rays(groups.groups, state))
-        values = whitened_misclosures(network, trial, groups, lin.workers)
-        return trial, values, float(values @ values) if np.isfinite(values).all() else np.inf
+    def moved(step: Floats) -> State:
+        return state.moved(unknowns, step, centres_of_rays(groups.groups, state))
 
-    tied = datum
+    def misclosures(step: Floats) -> tuple[State, Floats, float]:
+        trial = moved(step)
+        values = whitened_misclosures(network, trial, groups, workers)
+        with np.errstate(over="ignore"):
+            return trial, values, float(values @ values) if np.isfinite(values).all() else np.inf
+
+    tied, unknowns, workers = datum, lin.unknowns, lin.workers
     untied = replace(datum, held=np.zeros(0, dtype=np.intp), conditions=None)  # damping ties the datum down by itself
+    solver: Solver | None = None
     for count in range(1, settings.iterations + 1):
         datum = untied if damping > 0.0 else tied
-        solver = factor(lin, datum, damping)
+        if solver is not None and damping == 0.0 and last <= REUSE:
+            solver = solver.at(lin)  # the system hardly differs from the one that was factored
+        else:
+            solver = factor(lin, datum, damping)
         rhs = lin.transposed(lin.misclosure)
         step = datum.transform(solver.solve(rhs))
         change = lin.times(step)
@@ -365,7 +377,15 @@ def _iterate(
             step, predicted = lengthened * step, 2.0 * lengthened * float(step @ rhs) - lengthened**2 * float(change @ change)
         if lengthened == 1.0 and relative > max(BEND, 0.1 * last if np.isfinite(last) else 0.0):  # steps that shrink fast need no bending
             step = _bent(lin, solver, datum, step, change, lambda x: misclosures(x)[1])
-        trial, _, value = misclosures(step)
+        near = damping == 0.0 and relative <= NEAR
+        if near:  # sure to be taken: linearised at once
+            trial, solver = moved(step), solver.at(None)
+            del lin  # its memory is needed
+            lin = linearize(network, trial, unknowns, groups, workers)
+            with np.errstate(over="ignore"):
+                value = float(lin.misclosure @ lin.misclosure)
+        else:
+            trial, _, value = misclosures(step)
         gain = (objective - value) / predicted if predicted > 0.0 else 0.0
         at_rounding = relative < 1e-6 and abs(value - objective) <= 1e-9 * max(objective, floor)
         accepted = bool(gain > 1e-4 or at_rounding)
@@ -373,13 +393,18 @@ def _iterate(
         if settings.progress is not None:
             settings.progress(history[-1])
         if not accepted:
-            before = None
+            before = solver = None
+            if near:
+                lin = linearize(network, state, unknowns, groups, workers)
             curved |= relative < 1e-3  # large residuals bend the problem so much that full steps fail even beside the solution
             damping, growth, last = max(damping * growth, 1e-4 if relative > 0.1 else 1e-7), 2.0 * growth, np.inf
             continue
         state, objective = trial, value
         before = change if damping == 0.0 and lengthened == 1.0 else None
-        lin = linearize(network, state, lin.unknowns, groups, lin.workers)
+        solver = solver.at(None) if solver is not None and damping == 0.0 and relative <= REUSE else None
+        if not near:
+            del lin
+            lin = linearize(network, state, unknowns, groups, workers)
         stalled = stalled + 1 if relative <= 1e-7 and relative >= 0.8 * last else 0
         settled = relative <= settings.tolerance or stalled == 2 or (relative < 1e-9 and relative >= 0.5 * last)  # only rounding is left
         if settled and (damping == 0.0 or _full_step(lin, tied, factor) <= 1e-6):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ class Solver(Protocol):
     @property
     def rcond(self) -> float:
         """Reciprocal condition number of the scaled (reduced) normal matrix."""
+
+    def at(self, lin: Any) -> Solver:
+        """Return this factor for the system at a state nearby, as an approximate one; None only lets the old system go."""
 
     def solve(self, rhs: Floats) -> Floats:
         """Return N^-1 rhs for (u,) or (u, k) right-hand sides."""

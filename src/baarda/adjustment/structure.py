@@ -8,6 +8,7 @@ factorisation (Duff & Reid 1983); a cluster belongs to the front where its first
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -151,6 +152,36 @@ def rank_of_points(coordinates: Floats) -> Ints:
     rank = np.empty(len(key), dtype=np.intp)
     rank[np.argsort(key, kind="stable")] = np.arange(len(key))
     return rank
+
+
+def rank_for(groups: Sequence[Any], coordinates: Floats) -> Ints:
+    """Return the rank of points by place or by the images that see them, whichever puts points of the same images together.
+
+    Parameters
+    ----------
+    groups : sequence of observation groups
+    coordinates : (n, 3) array
+        Approximate coordinates; NaN = unknown.
+    """
+    seen = [g for g in groups if hasattr(g, "images") and hasattr(g, "points")]
+    by_place = rank_of_points(coordinates)
+    if not seen or not len(coordinates):
+        return by_place
+    images, points = np.concatenate([g.images for g in seen]), np.concatenate([g.points for g in seen])
+    first, last = np.full(len(coordinates), np.iinfo(np.intp).max), np.full(len(coordinates), -1)
+    np.minimum.at(first, points, images)
+    np.maximum.at(last, points, images)
+    by_image = np.empty(len(coordinates), dtype=np.intp)
+    by_image[np.lexsort((last, first))] = np.arange(len(coordinates))
+    return min((by_place, by_image), key=lambda rank: _spread_of_images(rank, images, points))
+
+
+def _spread_of_images(rank: Ints, images: Ints, points: Ints) -> float:
+    """Return how many images see the points of a small cluster, as a mean of squares over some of the clusters."""
+    base = rank[points] // BASE
+    some = base % max(1, (len(rank) // BASE) // 500) == 0
+    pairs = np.unique(base[some] * (int(images.max(initial=0)) + 1) + images[some])
+    return float(np.mean(np.unique(pairs // (int(images.max(initial=0)) + 1), return_counts=True)[1] ** 2.0))
 
 
 def _spread(x: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -345,22 +376,27 @@ def _clusters(first_block: Ints, chunk: Small, row: Small, seen: list[Ints], nod
                 number = seen[i][row[at], j]
                 mark[base[number >= 0], number[number >= 0]] = True
         sets += [np.flatnonzero(m) for m in mark]
-    touched = _touched(first_block, chunk, row, seen, nodes)
+    touched = _touched(first_block, chunk, row, seen, nodes).astype(float) ** 2
+    effort = np.concatenate([[0.0], np.cumsum(touched)])
+    width_of = nodes.width.tolist()
+    ends, seen_by = cuts.tolist(), [frozenset(s.tolist()) for s in sets]
+    widths = [sum(width_of[i] for i in s) for s in seen_by]
     first, members, sparse = [0], [], []
     k = 0
-    while k < len(sets):
-        union, end = sets[k], k + 1
-        width = widest = int(nodes.width[union].sum())
-        while end < len(sets) and cuts[end + 1] - cuts[k] <= MOST:
-            more = np.union1d(union, sets[end])
-            size = int(nodes.width[more].sum())
-            widest = max(widest, int(nodes.width[sets[end]].sum()))
-            if size > GROWTH * widest or size * (cuts[end + 1] - cuts[k]) > LARGEST:
+    while k < len(seen_by):
+        union, end = seen_by[k], k + 1
+        width = widest = widths[k]
+        while end < len(seen_by) and ends[end + 1] - ends[k] <= MOST:
+            more = union | seen_by[end]
+            size = width + sum(width_of[i] for i in seen_by[end] - union)
+            widest = max(widest, widths[end])
+            if size > GROWTH * widest or size * (ends[end + 1] - ends[k]) > LARGEST:
                 break
             union, width, end = more, size, end + 1
-        members.append(union)
-        first.append(int(cuts[end]))
-        sparse.append(width > SPARSE * float(np.sqrt(np.mean(touched[cuts[k] : cuts[end]] ** 2.0))))
+        members.append(np.array(sorted(union), dtype=np.intp))
+        first.append(ends[end])
+        mean = (effort[ends[end]] - effort[ends[k]]) / (ends[end] - ends[k])
+        sparse.append(width > SPARSE * float(np.sqrt(mean)))
         k = end
     return np.array(first, dtype=np.intp), members, np.array(sparse, dtype=bool)
 

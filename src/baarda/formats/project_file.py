@@ -62,7 +62,9 @@ class GroupTable(_Strict):
     """A group of observations: what its rows have in common."""
 
     name: Annotated[str, Field(min_length=1)]
-    kind: Literal["image_points", "distances", "directions", "angles", "height_differences", "camera_positions", "range_doppler"] = "image_points"
+    kind: Literal[
+        "image_points", "distances", "directions", "angles", "height_differences", "camera_positions", "range_doppler", "model_coordinates"
+    ] = "image_points"
     sigma: Sigma | None = None
     residual_plane: Plane | None = None
     repeated: bool = False

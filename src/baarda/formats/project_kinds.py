@@ -19,7 +19,7 @@ from baarda.formats.checks import correlations, sigma_range
 from baarda.formats.csv_table import CsvTable, numbers_text, quoted
 from baarda.formats.vector_tables import VECTOR_TABLES, VectorTable
 from baarda.network import AXES, Declared, Images, Network, Points
-from baarda.observations import Angles, CameraPositions, Directions, HeightDifferences, LeverArms, Stations, Strips, Tracks
+from baarda.observations import Angles, CameraPositions, Directions, HeightDifferences, LeverArms, Models, Stations, Strips, Tracks
 
 Floats = NDArray[np.float64]
 Columns = dict[str, list[str]]
@@ -165,8 +165,8 @@ KIND_TABLES: dict[str, KindTable | PositionTable | VectorTable] = {
         *VECTOR_TABLES,
     )
 }
-DECLARED: dict[str, type[Declared]] = {"station": Stations, "lever_arm": LeverArms, "strip": Strips, "track": Tracks}
-DECLARED_COLUMNS = (("kind", "node", "parameter", "value"), ("unit", "state", "given", "sigma"))
+DECLARED: dict[str, type[Declared]] = {"station": Stations, "lever_arm": LeverArms, "strip": Strips, "track": Tracks, "model": Models}
+DECLARED_COLUMNS = (("kind", "node", "parameter"), ("value", "unit", "state", "given", "sigma"))
 
 
 def kind_table_of(group: Any) -> KindTable | PositionTable | VectorTable:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from baarda.formats.checks import sigma_range
 from baarda.formats.csv_table import CsvTable, numbers_text, quoted
 from baarda.network import Declared, Images, Network, Points
+from baarda.observations.model_coordinates import ModelCoordinates
 from baarda.observations.range_doppler import RangeDoppler
 
 Floats = NDArray[np.float64]
@@ -107,5 +108,13 @@ VECTOR_TABLES = (
         ("t", "r"),
         lambda node, point, values, sigma, unit: RangeDoppler(node, point, values, sigma),
         lambda group: (group.tracks, group.points, group.tr),
+    ),
+    VectorTable(
+        "model_coordinates",
+        ModelCoordinates,
+        "model",
+        ("x", "y", "z"),
+        lambda node, point, values, sigma, unit: ModelCoordinates(node, point, values, sigma),
+        lambda group: (group.models, group.points, group.xyz),
     ),
 )

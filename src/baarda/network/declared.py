@@ -155,6 +155,10 @@ class Declared:
         """Return the group after increments of all parameters, (total,); zero for fixed ones."""
         return replace(self, values=self.values + step)
 
+    def departure(self, other: Self) -> Floats:
+        """Return the increments that lead from another state of the group to this one, (total,)."""
+        return np.asarray(self.values - other.values)
+
     def shifted(self, shift: Floats) -> Self:
         """Return the group after `shift` (3,) was added to all object coordinates; the default is for values without a place."""
         return self

@@ -9,6 +9,7 @@ from baarda.observations.distances import Distances
 from baarda.observations.height_differences import HeightDifferences
 from baarda.observations.image_coordinates import ImageCoordinates
 from baarda.observations.image_points import ImagePoints
+from baarda.observations.model_coordinates import ModelCoordinates, Models, models
 from baarda.observations.range_doppler import RangeDoppler, Tracks, tracks
 
 __all__ = [
@@ -24,6 +25,8 @@ __all__ = [
     "ImagePoints",
     "Kind",
     "LeverArms",
+    "ModelCoordinates",
+    "Models",
     "RangeDoppler",
     "Rows",
     "Stations",
@@ -31,6 +34,7 @@ __all__ = [
     "Tracks",
     "direct_observations",
     "lever_arms",
+    "models",
     "stations",
     "strips",
     "tracks",

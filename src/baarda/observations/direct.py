@@ -76,7 +76,7 @@ class Direct:
     def misclosures(self, network: Network, state: State) -> Floats:
         """Return observed - computed, (n, 1); differences of angles lie within half a turn."""
         difference = self.values - self._computed(state)
-        angle = (self.kind == "image") & (self.positions >= 3)
+        angle = (self.kind == "image") & (self.positions >= 3) | (self.kind == "station")
         return np.asarray(np.where(angle, np.remainder(difference + np.pi, 2.0 * np.pi) - np.pi, difference))[:, None]
 
     def linearize(self, network: Network, state: State) -> list[Rows]:

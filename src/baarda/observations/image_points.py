@@ -158,8 +158,8 @@ class ImagePoints:
         p, camera, image, rotation, vectors, ideal, d_vectors, _front = self._computed(optics, rows, network, state)
         measured = self.xy[rows]
         if self.residual_plane == "image":
-            computed, d_ideal, d_camera, _ = optics.distort(ideal, p, start=measured)
-            misclosure = measured - computed
+            computed, d_ideal, d_camera, valid = optics.distort(ideal, p, start=measured)
+            misclosure = np.where(valid[:, None], measured - computed, np.nan)  # a distortion that cannot be inverted
         else:
             projected, d_ideal, p_camera = optics.from_ideal(ideal, p)
             corrected, _, m_camera = optics.from_measured(measured, p)
@@ -186,29 +186,66 @@ class ImagePoints:
         p, *_, ideal, _d, _front = self._computed(optics, rows, network, state)
         measured = self.xy[rows]
         if self.residual_plane == "image":
-            return np.asarray(measured - optics.distort(ideal, p, start=measured)[0])
+            computed, _, _, valid = optics.distort(ideal, p, start=measured)
+            return np.asarray(np.where(valid[:, None], measured - computed, np.nan))
         return np.asarray((optics.from_measured(measured, p)[0] - optics.from_ideal(ideal, p)[0]) * _to_pixels(optics))
+
+    def images_of(self, network: Network, piece: Piece) -> str:
+        """Return in words which images the rows of a piece are of."""
+        names = [network.images.labels[i] for i in np.unique(self.images[piece.rows])]
+        return "images " + ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+    def fill(self, network: Network, state: State, piece: Piece, misclosure: Floats, parts: Any) -> Floats | None:
+        """Write the whitened misclosures and partials of a piece straight into the arrays of a chunk.
+
+        Parameters
+        ----------
+        network, state, piece
+            As for `linearize_piece`.
+        misclosure : (n, 2) array
+        parts : sequence of (positions, nodes (n,), partials (n, 2, w))
+            Of camera, image and point.
+
+        Returns
+        -------
+        (n, 2) array or None
+            The sigmas; None where this cannot be done and nothing was written.
+        """
+        if np.any(self.correlations[piece.rows]) or len(parts[2][0]) != 3:
+            return None
+        sigma, image = self.sigmas[piece.rows], self.images[piece.rows]
+        (keep_camera, cameras, d_camera), (keep_image, images, d_image), (_, points, d_point) = parts
+        done = self._loop(piece, network, state, True, 1.0 / sigma, keep_camera, keep_image, misclosure, d_camera, d_image, d_point)
+        if not done:
+            return None
+        cameras[:], images[:], points[:] = network.images.cameras[image], image, self.points[piece.rows]
+        return sigma
 
     def _compiled(self, piece: Piece, network: Network, state: State, partials: bool) -> tuple[Floats, Floats, Floats, Floats] | None:
         """Evaluate a piece by compiled loops; None for small groups, other cameras, and where a distortion cannot be inverted."""
-        table = state.camera_table(piece.width)
+        n, k = len(piece.rows), piece.width
+        count = n if partials else 0
+        out = np.empty((n, 2)), np.empty((count, 2, k)), np.empty((count, 2, 6)), np.empty((count, 2, 3))
+        done = self._loop(piece, network, state, partials, np.ones((n, 2)), np.arange(k), np.arange(6), *out)
+        return out if done else None
+
+    def _loop(
+        self, piece: Piece, network: Network, state: State, partials: bool, weights: Floats, cameras: Ints, images: Ints, *out: Floats
+    ) -> bool:
+        """Run the compiled loop over a piece, where there is one for its camera."""
         if len(self) < kernels.COMPILE_FROM:
-            return None
+            return False
         program, loop = kernels.Program.of(piece.optics), kernels.compiled()
         if program is None or loop is None:
-            return None
+            return False
         optics, image = piece.optics, self.images[piece.rows]
-        n, k = len(image), piece.width
-        misclosure = np.empty((n, 2))
-        count = n if partials else 0
-        d_camera, d_image, d_point = np.empty((count, 2, k)), np.empty((count, 2, 6)), np.empty((count, 2, 3))
         failed = loop(
             program.steps, program.places, program.measured, self.residual_plane == "corrected", _to_pixels(optics),
-            np.ascontiguousarray(optics.pixel_size, dtype=float), np.ascontiguousarray(optics.origin, dtype=float), table, state.rotation,
-            state.position, state.points, network.images.cameras[image], image, self.points[piece.rows], self.xy[piece.rows], partials,
-            misclosure, d_camera, d_image, d_point,
+            np.ascontiguousarray(optics.pixel_size, dtype=float), np.ascontiguousarray(optics.origin, dtype=float),
+            state.camera_table(piece.width), state.rotation, state.position, state.points, network.images.cameras[image], image,
+            self.points[piece.rows], self.xy[piece.rows], partials, weights, cameras, images, *out,
         )  # fmt: skip
-        return None if failed >= 0 else (misclosure, d_camera, d_image, d_point)
+        return bool(failed < 0)
 
     def in_front(self, network: Network, state: State) -> NDArray[np.bool_]:
         """Return for each row whether its point lies in front of its camera."""

@@ -183,10 +183,15 @@ def _chain(steps: Ints, places: Ints, begin: int, end: int, xy: Floats, p: Float
 def _evaluate(
     steps: Ints, places: Ints, measured: int, corrected: bool, to_pixels: Floats, pixel_size: Floats, origin: Floats,
     parameters: Floats, rotation: Floats, position: Floats, points: Floats, camera: Ints, image: Ints, point: Ints, pixels: Floats,
-    partials: bool, misclosure: Floats, d_camera: Floats, d_image: Floats, d_point: Floats,
+    partials: bool, weights: Floats, keep_camera: Ints, keep_image: Ints, misclosure: Floats, d_camera: Floats, d_image: Floats,
+    d_point: Floats,
 ) -> int:  # fmt: skip
-    """Fill the misclosures (n, 2) and partials of image points; return the first row whose distortion could not be inverted, or -1."""
+    """Fill the misclosures (n, 2) and partials of image points, each times its weight, of the parameters to keep.
+
+    Returns the first row whose distortion could not be inverted, or -1.
+    """
     k = parameters.shape[1]
+    own = np.empty(6)
     d, dm = np.empty((2, 2)), np.empty((2, 2))
     dp, dmp = np.zeros((2, k)), np.zeros((2, k))
     target, xy = np.empty(2), np.empty(2)
@@ -246,23 +251,29 @@ def _evaluate(
             det = dm[0, 0] * dm[1, 1] - dm[0, 1] * dm[1, 0]
             a, b = dm[1, 1] / det / pixel_size[0], -dm[0, 1] / det / pixel_size[0]
             c, e = -dm[1, 0] / det / pixel_size[1], dm[0, 0] / det / pixel_size[1]
+        misclosure[i, 0] *= weights[i, 0]
+        misclosure[i, 1] *= weights[i, 1]
         if not partials:
             continue
-        for j in range(k):
+        for place in range(len(keep_camera)):
+            j = keep_camera[place]
             t0, t1 = dp[0, j] - dmp[0, j], dp[1, j] - dmp[1, j]
-            d_camera[i, 0, j] = a * t0 + b * t1
-            d_camera[i, 1, j] = c * t0 + e * t1
+            d_camera[i, 0, place] = (a * t0 + b * t1) * weights[i, 0]
+            d_camera[i, 1, place] = (c * t0 + e * t1) * weights[i, 1]
         for r in range(2):
             f0 = a * d[0, 0] + b * d[1, 0] if r == 0 else c * d[0, 0] + e * d[1, 0]
             f1 = a * d[0, 1] + b * d[1, 1] if r == 0 else c * d[0, 1] + e * d[1, 1]
+            f0, f1 = f0 * weights[i, r], f1 * weights[i, r]
             h[r, 0], h[r, 1], h[r, 2] = -f0 / w, -f1 / w, -(f0 * xn + f1 * yn) / w
             for j in range(3):
                 value = h[r, 0] * m[0, j] + h[r, 1] * m[1, j] + h[r, 2] * m[2, j]
                 d_point[i, r, j] = value
-                d_image[i, r, j] = -value
-            d_image[i, r, 3] = h[r, 2] * v - h[r, 1] * w
-            d_image[i, r, 4] = h[r, 0] * w - h[r, 2] * u
-            d_image[i, r, 5] = h[r, 1] * u - h[r, 0] * v
+                own[j] = -value
+            own[3] = h[r, 2] * v - h[r, 1] * w
+            own[4] = h[r, 0] * w - h[r, 2] * u
+            own[5] = h[r, 1] * u - h[r, 0] * v
+            for place in range(len(keep_image)):
+                d_image[i, r, place] = own[keep_image[place]]
     return -1
 
 

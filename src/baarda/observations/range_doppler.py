@@ -271,6 +271,10 @@ class RangeDoppler:
         """Return the point codes."""
         return {"point": self.points}
 
+    def with_values(self, values: Floats) -> RangeDoppler:
+        """Return the group with other observed values, (n, 2)."""
+        return replace(self, tr=values)
+
     def with_start(self, network: Network, aside: NDArray[np.bool_]) -> Network:
         """Return the network with start values of tracks and points that have none; see `range_doppler_start.with_start`."""
         from baarda.observations.range_doppler_start import with_start

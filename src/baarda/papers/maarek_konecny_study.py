@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
 from baarda import cameras
-from baarda.adjustment import adjust
 from baarda.distributions import law
 from baarda.distributions.base import Floats
 from baarda.errors import UsageError
@@ -20,6 +18,7 @@ from baarda.hypotheses._error_kurtosis import a_of_kurtosis, kurtosis_of_errors
 from baarda.network import CONTROL, Images, Network, Points, State
 from baarda.observations import ImagePoints
 from baarda.papers import _maarek_konecny_printed as p
+from baarda.procedures.multi_set_resection import SetResiduals, adjust_sets
 
 __all__ = ["Study", "a_of_kurtosis", "elementary_errors", "grid_network", "scale_rule", "study"]
 
@@ -113,82 +112,24 @@ def grid_network(side: int, label: str, rng: np.random.Generator, errors: Floats
 
 
 @dataclass(frozen=True)
-class Study:
-    """Residuals of all sets, and the maps from errors to residuals.
+class Study(SetResiduals):
+    """Residuals of all sets, um, and the law that their errors were drawn from.
 
     Attributes
     ----------
-    labels : tuple of str
-        Names of the sets.
-    residuals : (n,) array
-        V, um.
-    sets : (n,) int array
-        Set of each residual.
-    redundancies : (k,) int array
-        r of each set.
-    projectors : tuple of arrays
-        R = Qvv P of each set: v = -R e.
     a, sigma : float
         The law that the errors were drawn from.
     seed : int
     """
 
-    labels: tuple[str, ...]
-    residuals: Floats
-    sets: NDArray[np.intp]
-    redundancies: NDArray[np.intp]
-    projectors: tuple[Floats, ...]
     a: float
     sigma: float
     seed: int
 
-    @cached_property
-    def shares(self) -> Floats:
-        """Redundancy numbers R_ii, for equal weights the cofactors of the residuals."""
-        return np.concatenate([np.diag(r) for r in self.projectors])
-
-    @cached_property
-    def fourth(self) -> Floats:
-        """Sum over j of R_ij^4, for each residual."""
-        return np.concatenate([np.sum(r**4, axis=1) for r in self.projectors])
-
-    @property
-    def redundancy(self) -> int:
-        """Sum of the redundancies."""
-        return int(self.redundancies.sum())
-
-    @cached_property
-    def variances(self) -> Floats:
-        """S_i^2 = V'V / r of each set, um^2."""
-        return np.bincount(self.sets, self.residuals**2) / self.redundancies
-
-    @property
-    def sigma0(self) -> float:
-        """The pooled S_o, um."""
-        return float(np.sqrt(self.residuals @ self.residuals / self.redundancy))
-
-    @property
-    def standardised(self) -> Floats:
-        """V / (S_o sqrt(q))."""
-        return np.asarray(self.residuals / (self.sigma0 * np.sqrt(self.shares)))
-
-    def residuals_of(self, errors: Floats) -> Floats:
-        """Map errors (n, B) to residuals -R e, (n, B), set by set."""
-        ends = np.cumsum([len(r) for r in self.projectors])
-        return np.concatenate([-(r @ e) for r, e in zip(self.projectors, np.split(errors, ends[:-1]), strict=True)])
-
     @property
     def evidence(self) -> Evidence:
         """What tests through Qvv need; the a-priori standard deviation is that of the errors."""
-        return Evidence(
-            residuals=self.residuals,
-            sigmas=np.full(len(self.residuals), self.sigma),
-            vpv=float(self.residuals @ self.residuals) / self.sigma**2,
-            redundancy=self.redundancy,
-            qvv=self.shares * self.sigma**2,
-            redundancy_numbers=self.shares,
-            residuals_of=self.residuals_of,
-        )
+        return self.evidence_of(self.sigma)
 
     def kurtosis_of_errors(self, residuals: Floats) -> tuple[Floats, Floats]:
         """Estimate sigma^4 of the errors, and sigma^4 times their excess kurtosis, from residuals; both without bias.
@@ -248,18 +189,13 @@ def study(a: float = 0.5, sigma: float = 7.92, seed: int = 1972) -> Study:
     (19, 630, 516)
     """
     rng = np.random.default_rng(seed)
-    labels, residuals, redundancies, projectors = [], [], [], []
+    networks = []
     for name, number, side in SETS:
         for k in range(number):
-            label = f"{name}, set {k + 1}"
             errors = elementary_errors(2 * side * side, a, sigma, rng)
-            result = adjust(grid_network(side, label, rng, errors, sigma))
-            labels.append(label)
-            residuals.append(result.residuals)
-            redundancies.append(result.redundancy)
-            projectors.append(-result.residuals_of(np.eye(result.count)))
-    sets = np.repeat(np.arange(len(labels)), [len(v) for v in residuals])
-    return Study(tuple(labels), np.concatenate(residuals), sets, np.array(redundancies), tuple(projectors), a, sigma, seed)
+            networks.append(grid_network(side, f"{name}, set {k + 1}", rng, errors, sigma))
+    found = adjust_sets(networks).residuals
+    return Study(found.labels, found.residuals, found.sets, found.redundancies, found.projectors, a, sigma, seed)
 
 
 @dataclass(frozen=True)

@@ -106,6 +106,7 @@ def error_free(network: Network) -> Network:
         images=replace(images, given=np.where(np.isfinite(images.given), exterior, np.nan)),
         points=replace(points, given=np.where(np.isfinite(points.given), points.coordinates, np.nan)),
         observations=tuple(groups),
+        declared=tuple(replace(d, given=np.where(np.isfinite(d.given), d.values, np.nan)) for d in network.declared),
     )
 
 
@@ -130,6 +131,8 @@ def with_values(group: Any, values: Floats) -> Any:
         xy = np.array(group.whole.xy)
         xy[np.arange(len(xy)), group.axes] = values[:, 0]
         return replace(group, whole=replace(group.whole, xy=xy))
+    if hasattr(group, "with_values"):
+        return group.with_values(values)
     if "values" not in {f.name for f in fields(group)}:
         raise UsageError(f"observations of the kind {type(group).__name__} cannot be simulated")
     return replace(group, values=np.asarray(values).reshape(np.shape(group.values)))

@@ -1,4 +1,4 @@
-"""A simulated radar image with known truth, like that of Yangmei (Wu, Liu & Lin 2000), its adjustment, and withheld points with given height."""
+"""A simulated radar image with known truth, like that of Yangmei (Wu, Liu & Lin 2000), and withheld points with given height."""
 
 from __future__ import annotations
 
@@ -287,11 +287,34 @@ def planimetry(
     else:
         rng = np.random.default_rng(seed)
         parts = [np.sort(rng.permutation(len(control))[:size]) for _ in range(turns)]
+    return planimetry_of([(network, control[part]) for part in parts], alpha, tell, **settings)
+
+
+def planimetry_of(
+    turns: Sequence[tuple[Network, NDArray[np.intp]]], alpha: float = 0.05, tell: Callable[[str], None] | None = None, **settings: Any
+) -> Planimetry:
+    """Withhold X and Y of given points of given networks, one after the other.
+
+    Parameters
+    ----------
+    turns : sequence of (Network, int array)
+        For each turn the network, and the indices of the control points that keep their height only.
+    alpha, tell, **settings
+        See `planimetry`.
+
+    Returns
+    -------
+    Planimetry
+
+    Raises
+    ------
+    UsageError
+        If a turn does not converge.
+    """
     labels: list[str] = []
     turn, differences, sigmas, sigma0 = [], [], [], []
     mean, fourth, square = np.zeros(3), np.zeros(3), np.zeros(3)
-    for k, part in enumerate(parts):
-        out = control[part]
+    for k, (network, out) in enumerate(turns):
         a = adjust(withhold_plan(network, out.tolist()), **settings)
         if a.status != "converged":
             raise UsageError(f"turn {k + 1} did not converge; {a.contradictions()}")
@@ -301,13 +324,13 @@ def planimetry(
             square[j] += float(np.sum(d.ravel()[at] ** 2))
             mean[j] += float(np.trace(block))
             fourth[j] += float(np.sum(block * block))
-        labels += [table.labels[i] for i in out]
+        labels += [network.points.labels[i] for i in out]
         turn += [k] * len(out)
         differences.append(d)
         sigmas.append(np.sqrt(np.diag(c)).reshape(-1, 2))
         sigma0.append(a.sigma0)
         if tell is not None:
-            tell(f"turn {k + 1} of {len(parts)}: {len(out)} points withheld in plan, rms {np.sqrt(np.mean(d**2)):.4g} {network.unit}")
+            tell(f"turn {k + 1} of {len(turns)}: {len(out)} points withheld in plan, rms {np.sqrt(np.mean(d**2)):.4g} {network.unit}")
     df = mean**2 / fourth
     low, high = (np.sqrt(square / len(labels) * df / stats.chi2.ppf(q, df)) for q in (1.0 - alpha / 2.0, alpha / 2.0))
     rms, predicted = np.sqrt(square / len(labels)), np.sqrt(mean / len(labels))

@@ -145,6 +145,7 @@ class Experiment:
         net = a.network
         cameras = [np.array(c.prior) for c in net.cameras]
         exterior, given = np.array(net.images.given), np.array(net.points.given)
+        declared = {d.kind: d for d in net.declared}
         groups = []
         for g, group in enumerate(a.groups):
             e = errors[a.offsets[g] : a.offsets[g + 1]].reshape(len(group), -1)
@@ -153,6 +154,11 @@ class Experiment:
             elif isinstance(group, Direct) and group.kind == "camera":
                 for node, k, value in zip(group.nodes, group.positions, e[:, 0], strict=True):
                     cameras[node][k] += value
+            elif isinstance(group, Direct) and group.kind in declared:
+                d = declared[group.kind]
+                value = np.array(d.given)
+                value[d.offsets[group.nodes] + group.positions] += e[:, 0]
+                declared[group.kind] = replace(d, given=value)
             elif isinstance(group, Direct):
                 table = exterior if group.kind == "image" else given
                 table[group.nodes, group.positions] += e[:, 0]
@@ -170,6 +176,7 @@ class Experiment:
             images=replace(net.images, given=exterior),
             points=replace(net.points, given=given),
             observations=tuple(groups),
+            declared=tuple(declared.values()),
         )
 
     def batch(self, first: int, stop: int) -> Batch:
@@ -306,7 +313,7 @@ def errors_of(truth: State, result: Adjustment) -> Floats:
         "image": np.concatenate([state.position - truth.position, turn], axis=1).ravel(),
         "point": (state.points - truth.points).ravel(),
     }
-    parts |= {d.kind: d.values - truth[d.kind].values for d in state.declared}
+    parts |= {d.kind: d.departure(truth[d.kind]) for d in state.declared}
     for group in result.numbering.groups:
         used = group.columns >= 0
         out[group.columns[used]] = parts[group.kind][used]

@@ -12,6 +12,7 @@ from scipy import stats
 
 from baarda.adjustment import Adjustment, adjust
 from baarda.adjustment.solve import Settings, prepare
+from baarda.cameras import FREE
 from baarda.distributions.base import Distribution
 from baarda.errors import BaardaError, UsageError
 from baarda.hypotheses.levels import Options, baarda_level, single_level
@@ -92,7 +93,8 @@ class Search:
         network, _ = self._network(removed, self.a)
         try:
             aside = prepare(network, Settings.of(network, self.settings))[1]
-            lost = np.flatnonzero(aside & ~self.first.aside)
+            unknown = (network.points.states == FREE).any(axis=1)  # a known point that nothing measures any more is no loss
+            lost = np.flatnonzero(aside & ~self.first.aside & unknown)
             if len(lost):
                 names = ", ".join(self.base.points.labels[i] for i in lost[:5])
                 return f"point {names} would no longer be determined by enough whole image points"

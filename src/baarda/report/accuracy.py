@@ -96,7 +96,7 @@ class Accuracy:
 
     @property
     def radius_95(self) -> float:
-        """NSSDA horizontal accuracy at 95 %: 2.4477 (RMSE_x + RMSE_y) / 2, which is 1.7308 RMSE_r for equal ones; NaN for a ratio below 0.6.
+        """NSSDA horizontal accuracy at 95 %: 2.4477 (RMSE_x + RMSE_y) / 2, that is 1.7308 RMSE_r for equal ones; NaN for a ratio below 0.6.
 
         FGDC-STD-007.3-1998, appendix 3-A, cases 1 and 2.
         """
@@ -104,7 +104,7 @@ class Accuracy:
 
     @property
     def radius_90(self) -> float:
-        """CE90, circular error at 90 %: 2.1460 (RMSE_x + RMSE_y) / 2, which is 1.5175 RMSE_r for equal ones; NaN for a ratio below 0.6.
+        """CE90, circular error at 90 %: 2.1460 (RMSE_x + RMSE_y) / 2, that is 1.5175 RMSE_r for equal ones; NaN for a ratio below 0.6.
 
         FGDC-STD-007.3-1998, appendix 3-D.
         """

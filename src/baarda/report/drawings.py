@@ -213,7 +213,7 @@ def space(scene: Scene, name: str = "block-in-space", most_ellipses: int = 60) -
             values, vectors = np.linalg.eigh(view @ scene.covariances[: len(chosen)] @ view.T)
             axis = 2.0 * scene.enlarged * np.sqrt(np.maximum(values, 0.0))
             angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
-            style = {"units": "xy", "facecolors": "none", "edgecolors": MUTED, "linewidths": 0.6, "zorder": 3}
+            style: dict[str, Any] = {"units": "xy", "facecolors": "none", "edgecolors": MUTED, "linewidths": 0.6, "zorder": 3}
             axes.add_collection(
                 EllipseCollection(axis[:, 1], axis[:, 0], angle, offsets=xy[chosen], offset_transform=axes.transData, **style)
             )

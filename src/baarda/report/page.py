@@ -277,6 +277,7 @@ def overall(analysis: Analysis, made: list[Section]) -> tuple[str, str]:
 
 
 def facts(analysis: Analysis) -> list[tuple[str, str]]:
+    """Return names and values for the head of the page."""
     a = analysis.adjustment
     net = a.network
     facts = [("images", str(len(net.images.labels))), ("points", str(int((~a.aside).sum()))), ("observations n", str(a.count))]

@@ -177,10 +177,10 @@ def histogram(
         axes.set_xlim(-reach, reach)
         axes.set_xlabel(tr(label))
         axes.set_ylabel(tr("density (per unit)"))
-        axes.legend(loc="upper right")
+        figure.legend(loc="outside lower center", ncols=2)
         _quiet(axes, "y")
 
-    return drawn(name, (5.2, 3.6), draw)
+    return drawn(name, (5.2, 4.2), draw)
 
 
 def quantiles(
@@ -221,7 +221,7 @@ def quantiles(
         axes.legend(loc="upper left")
         _quiet(axes)
 
-    return drawn(name, (5.2, 3.6), draw)
+    return drawn(name, (5.2, 4.2), draw)
 
 
 def heat_map(matrix: Floats, labels: Sequence[str], name: str) -> str:
@@ -401,7 +401,8 @@ def plan(
             at = np.flatnonzero((kinds == kind) & free)
             if len(at):
                 colours = {"c": sigmas[at], "cmap": "viridis", "vmin": limits[0], "vmax": limits[1]}
-                shown = axes.scatter(*(points[at][:, [0, k]] - origin[[0, k]]).T, area, label=tr(f"{kind} points"), **colours, **style, **rim)
+                where = (points[at][:, [0, k]] - origin[[0, k]]).T
+                shown = axes.scatter(*where, area, label=tr(f"{kind} points"), **colours, **style, **rim)
             at = np.flatnonzero((kinds == kind) & ~free)
             if len(at):
                 axes.scatter(points[at, 0] - origin[0], points[at, k] - origin[k], area, facecolors="none", edgecolors=INK, linewidths=0.9,

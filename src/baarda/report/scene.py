@@ -260,4 +260,4 @@ def _halves(net: Any) -> Floats:
         if c.image_size is not None and distance > 0.0:
             half = np.array(c.image_size) * np.abs(np.array(c.pixel_size)) / 2.0 / distance
         out.append(np.clip(half, 0.08, 1.2))
-    return np.array(out).reshape(-1, 2)[net.images.cameras]
+    return np.asarray(np.array(out).reshape(-1, 2)[net.images.cameras])

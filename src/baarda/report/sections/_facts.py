@@ -80,7 +80,12 @@ def label_of(analysis: Analysis, row: int) -> str:
     g = int(np.searchsorted(a.offsets, row, side="right")) - 1
     image, point = table["image"][row], table["point"][row]
     head = "" if isinstance(a.groups[g], (ImageCoordinates, ImagePoints)) else f"{table['group'][row]},"
-    parts = (head, say("image {name}", name=image) if image else "", say("point {name}", name=point) if point else "", str(table["component"][row]))
+    parts = (
+        head,
+        say("image {name}", name=image) if image else "",
+        say("point {name}", name=point) if point else "",
+        str(table["component"][row]),
+    )
     return " ".join(part for part in parts if part)
 
 

@@ -40,7 +40,8 @@ def _statement(a: Accuracy, told: str, factor: float) -> list[Block]:
     else:
         text, tone = (
             "The ASPRS Positional Accuracy Standards for Digital Geospatial Data, Edition 2, call for at least {enough} check points; this "
-            "test was made with only {nh} horizontal and {nv} vertical ones: RMSE_H = {h} {unit}, RMSE_V = {v} {unit}. It is no statement of "
+            "test was made with only {nh} horizontal and {nv} vertical ones: RMSE_H = {h} {unit}, RMSE_V = {v} {unit}. It "
+            "is no statement of "
             "an accuracy class.",
             "warn",
         )
@@ -61,7 +62,8 @@ def _statement(a: Accuracy, told: str, factor: float) -> list[Block]:
     biased = [k for k in range(3) if a.points[k] > 1 and abs(a.mean[k]) > _NOTABLE * a.rmse[k]]
     if biased:
         text = (
-            "The mean difference exceeds 25 % of the RMSE: {which}. ASPRS asks to look into mean errors above 25 % of the RMSE of the class; "
+            "The mean difference exceeds 25 % of the RMSE: {which}. ASPRS asks to look into mean errors above 25 % of the "
+            "RMSE of the class; "
             "without a class the RMSE found stands for it."
         )
         which = ", ".join(f"{'XYZ'[k]} {fixed(a.mean[k] * factor, decimals)} {told} (p = {fixed(a.mean_p[k], 3)})" for k in biased)
@@ -106,7 +108,8 @@ def _figures(a: Accuracy, told: str, factor: float) -> DataTable:
         Column("conditions", "", "under which the figure means what its name says", "left"),
     )
     note = say(
-        "RMSE_H, RMSE_V, RMSE_3D: ASPRS Positional Accuracy Standards, Edition 2 (2023). NSSDA: FGDC-STD-007.3-1998; its radii and CE90, LE90 "
+        "RMSE_H, RMSE_V, RMSE_3D: ASPRS Positional Accuracy Standards, Edition 2 (2023). NSSDA: FGDC-STD-007.3-1998; "
+        "its radii and CE90, LE90 "
         "leave the survey's error out and hold for at least {enough} points, unbiased normal differences, and a ratio of the lesser to the "
         "larger RMSE in X and Y of 0.6 at least (here {ratio}; below, no radius is given). Bias and normality are tested at level 0.05.",
         enough=ENOUGH_NSSDA,
@@ -175,7 +178,8 @@ def _lengths(lengths: Lengths, unit: str) -> list[Block]:
         )
     if not all(held.values()):
         note += " " + say(
-            "It is no acceptance test: the guideline asks for seven lines of at least five lengths each (35; here {seen}), the longest at least "
+            "It is no acceptance test: the guideline asks for seven lines of at least five lengths each (35; here {seen}), "
+            "the longest at least "
             "two thirds of the space diagonal ({share} of {span} {unit}), none of them used for the scale.",
             seen=seen,
             share=significant(float(np.max(lengths.given) / lengths.span), 2),

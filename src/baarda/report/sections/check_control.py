@@ -129,7 +129,10 @@ def _prior_and_posterior(analysis: Analysis, e: Estimates) -> list[Block]:
         rows.append((label, *numbers, *(fixed(float(v), 3) for v in shares[label][1])))
     columns = (
         Column("point", "", "", "left"),
-        *(Column(say("prior s{axis}", axis=axis), unit, say("given standard deviation, {scaling}", scaling=scaling(analysis))) for axis in AXES),
+        *(
+            Column(say("prior s{axis}", axis=axis), unit, say("given standard deviation, {scaling}", scaling=scaling(analysis)))
+            for axis in AXES
+        ),
         *(Column(say("posterior s{axis}", axis=axis), unit, "of the adjusted coordinate") for axis in AXES),
         *(
             Column(f"r {axis}", "", "redundancy number: share of an error of the given coordinate that shows in its residual")

@@ -72,7 +72,11 @@ def _build(analysis: Analysis) -> list[Block] | None:
         Paragraph(intro),
         DataTable("Errors of withheld control points", columns, rows),
         DataTable(
-            "Withheld coordinates", single, each, "" if len(c.rows) <= _MOST else say("The first {most}; all are in result.json.", most=_MOST), True
+            "Withheld coordinates",
+            single,
+            each,
+            "" if len(c.rows) <= _MOST else say("The first {most}; all are in result.json.", most=_MOST),
+            True,
         ),
     ]
     failed = [f for f in c.folds if f.problem]

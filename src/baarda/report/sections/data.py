@@ -59,7 +59,14 @@ def _model(analysis: Analysis) -> list[Block]:
         ("rotation", "camera from object, M = R3(kappa) R2(phi) R1(omega); the camera looks along -z, x right, y up"),
     ]
     columns = (Column("item", "", "", "left"), Column("choice", "", "", "left"))
-    return [DataTable("Model", columns, tuple(rows), "" if len(net.cameras) <= 8 else say("The first {most} of {count} cameras.", most=8, count=len(net.cameras)))]
+    return [
+        DataTable(
+            "Model",
+            columns,
+            tuple(rows),
+            "" if len(net.cameras) <= 8 else say("The first {most} of {count} cameras.", most=8, count=len(net.cameras)),
+        )
+    ]
 
 
 def _apriori(analysis: Analysis) -> DataTable:

@@ -68,7 +68,15 @@ def _critical(found: CriticalValues) -> list[Block]:
         levels = (significant(c.level_w, 2), significant(c.level_tau, 2))
         rows.append((span, str(c.count), *_limit(c.w), *_limit(c.tau), *levels, *_limit(c.delta0), fixed(ratio, 2)))
     n = int((found.members >= 0).sum())
-    rows.append((say("largest of all, level {alpha}", alpha=f"{found.family_alpha:.3g}"), str(n), *_limit(found.family_w), *_limit(found.family_tau), *[""] * 5))
+    rows.append(
+        (
+            say("largest of all, level {alpha}", alpha=f"{found.family_alpha:.3g}"),
+            str(n),
+            *_limit(found.family_w),
+            *_limit(found.family_tau),
+            *[""] * 5,
+        )
+    )
     columns = (
         Column(
             "redundancy",

@@ -92,7 +92,8 @@ def _figure(analysis: Analysis, index: int) -> Figure | None:
     name = f"reliability-map-{index + 1}"
     svg = drawings.cell_maps(maps, frame, camera.y_down, name)
     caption = say(
-        "Reliability over the image of camera {label}: mean redundancy number of the {count} image points in each cell, from {low} to {high}.",
+        "Reliability over the image of camera {label}: mean redundancy number of the {count} image points in each "
+        "cell, from {low} to {high}.",
         label=camera.label,
         count=len(xy),
         low=fixed(float(np.nanmin(shares)), 2),

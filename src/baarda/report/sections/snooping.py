@@ -25,7 +25,9 @@ def _intro(s: Snooping) -> str:
         start=start,
         what=what,
         law=s.law or "its law",
-        alpha=f"{s.alpha:.3g}" if s.levels in ("none", "baarda") else say("{alpha} for the family, {levels}", alpha=f"{s.alpha:.3g}", levels=s.levels),
+        alpha=f"{s.alpha:.3g}"
+        if s.levels in ("none", "baarda")
+        else say("{alpha} for the family, {levels}", alpha=f"{s.alpha:.3g}", levels=s.levels),
     )
 
 

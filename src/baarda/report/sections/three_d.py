@@ -14,7 +14,8 @@ def _caption(analysis: Analysis, scene: Scene) -> str:
     free = scene.sigmas[scene.sigmas > 0.0]
     parts = [
         say(
-            "{points} object points, coloured by their spatial standard deviation ({scaling}), and {images} images as pyramids that open in "
+            "{points} object points, coloured by their spatial standard deviation ({scaling}), and {images} images as "
+            "pyramids that open in "
             "the viewing direction.",
             points=scene.total,
             images=len(scene.images),
@@ -24,7 +25,8 @@ def _caption(analysis: Analysis, scene: Scene) -> str:
     if len(free):
         parts.append(
             say(
-                "The standard deviations reach from {low} to {high} {unit}; ellipsoids of 95 % confidence, those of the weakest points, are "
+                "The standard deviations reach from {low} to {high} {unit}; ellipsoids of 95 % confidence, those of the "
+                "weakest points, are "
                 "drawn {times} times too large.",
                 low=significant(float(free.min()), 2),
                 high=significant(float(free.max()), 2),

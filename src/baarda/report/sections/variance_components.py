@@ -35,7 +35,9 @@ def _table(found: VarianceComponents) -> DataTable:
         Column("stated is right", "", "", "left"),
         Column("outcome", "", "", "left"),
     )
-    return DataTable("Standard deviations of groups of observations", columns, tuple(rows), say("Law of the test: {law}.", law=single.law_name))
+    return DataTable(
+        "Standard deviations of groups of observations", columns, tuple(rows), say("Law of the test: {law}.", law=single.law_name)
+    )
 
 
 def _build(analysis: Analysis) -> list[Block] | None:
