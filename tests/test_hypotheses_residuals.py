@@ -238,3 +238,20 @@ def test_wrong_arguments(call: object) -> None:
 def test_no_redundancy() -> None:
     with pytest.raises(RedundancyNotPositive):
         variance_factor.global_variance_factor(1.0, 0)
+
+
+@pytest.mark.parametrize("loc", [None, 0.0])
+def test_the_likelihood_ratio_is_that_of_the_fits(loc):
+    """Few values often have two maxima of a, one at either bound: the simulated search must find the better one as `fit` does."""
+    from baarda.distributions import fit
+    from baarda.hypotheses.goodness_of_fit import normal_against_modulated
+
+    rng = np.random.default_rng(3)
+    short = []
+    for n in (10, 25, 50, 100) * 4:
+        x = rng.standard_t(4, n)
+        best = 2.0 * (fit(x, "modulated_normal", loc=loc).log_likelihood - fit(x, "normal", loc=loc).log_likelihood)
+        short.append(best - normal_against_modulated(x, loc=loc, replicas=1).statistic)
+    assert max(short) < (0.5 if loc is None else 0.1)
+    assert min(short) > -1e-6
+    assert np.median(short) < 0.05

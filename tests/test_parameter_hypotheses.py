@@ -306,3 +306,14 @@ def test_dropped_components_are_a_constrained_adjustment(basis):
     assert nothing == 0.0
     with pytest.raises(UsageError):
         orthogonalisation.reduced_parameters(o, [True])
+
+
+def test_epochs_of_unequal_precision_are_judged_each_by_its_own_factor():
+    q = np.diag([0.1, 0.2])
+    pooled = parameter_groups.equal_parameters_of_epochs([1.0, 2.0], q, 1.0, 30, [1.2, 1.5], q, 1.3, 20)
+    assert pooled.df == (2.0, 50.0)
+    assert not pooled.details["variance_ratio"]["rejected"]
+    own = parameter_groups.equal_parameters_of_epochs([1.0, 2.0], q, 1.0, 30, [1.2, 1.5], q, 9.0, 20)
+    assert own.df == (2.0, 20.0)
+    assert own.statistic == pytest.approx(0.5 * (0.04 / 1.0 + 0.25 / 2.0))  # differences over (1 + 9) q
+    assert "differ" in own.note

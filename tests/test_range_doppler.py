@@ -12,11 +12,13 @@ from baarda.cameras import FIXED, OBSERVED
 from baarda.errors import InputError, RedundancyNotPositive, Singular, UsageError
 from baarda.formats.project import project
 from baarda.geometry import range_doppler as radar
+from baarda.hypotheses.levels import Options
 from baarda.network import CONTROL, Images, Network, Points
 from baarda.observations import RangeDoppler, tracks
 from baarda.procedures.camera_selection import select_parameters
 from baarda.procedures.cross_validation import cross_validate
 from baarda.procedures.radar_simulation import PIXEL, SPEED, planimetry, simulate_radar
+from baarda.procedures.snooping import snoop
 
 
 def some(n=6, seed=1, order=3, turns=2):
@@ -451,3 +453,26 @@ def test_cross_validation_keeps_heights(made):
     assert len(c.rows) == 70
     horizontal = next(e for e in c.errors if e.name == "horizontal")
     assert horizontal.low < horizontal.predicted < horizontal.high
+
+
+def test_snooping_finds_a_gross_error():
+    """An error of 12 pixels in r of a control point: found, rejected; the point, which is known, is no loss."""
+    made = simulate_radar(2)
+    o = made.network.observations[0]
+    tr = np.array(o.tr)
+    tr[7, 1] += 12.0
+    found, a = snoop(replace(made.network, observations=(replace(o, tr=tr),)), Options(), "coordinate", None)
+    assert [(s.action, s.point, s.component) for s in found.steps] == [("rejected", "C8", "r")]
+    assert found.steps[0].estimated_error == pytest.approx(12.0, abs=3.5)
+    assert a.redundancy == 51
+
+
+def test_priors_of_tracks_can_be_removed_and_predicted(made):
+    """A grossly wrong prior of the antenna's position is found by snooping."""
+    group = made.tracks
+    at = [group.named(0, n) for n in ("X0", "Y0", "Z0")]
+    states, given, sigmas = np.array(group.states), np.full(len(group.values), np.nan), np.full(len(group.values), np.nan)
+    states[at], given[at], sigmas[at] = OBSERVED, group.values[at] + [0.0, 0.0, 900.0], 5.0
+    network = replace(made.network, declared=(replace(made.network.declared[0], states=states, given=given, sigmas=sigmas),))
+    found, _ = snoop(network, Options(), "coordinate", None)
+    assert [(s.action, s.group, s.component) for s in found.steps] == [("rejected", "track parameters", "Z0")]

@@ -306,3 +306,15 @@ def test_critical_values_that_make_no_sense(plain, options, message):
         critical_values(plain, **options)
     with pytest.raises(UsageError, match="square"):
         critical_values_of_projector(np.ones((2, 3)), law("radico")())
+
+
+def test_the_verdict_says_which_law_and_what_it_resists():
+    from baarda.hypotheses.levels import Options
+    from baarda.procedures.testing import analyse
+    from baarda.report.sections.verdict import sentences
+
+    made = baarda.adjust(ring(control=5), robust="modulated_normal", robust_shapes={"a": 0.5})
+    text = next(s.text for s in sentences(analyse(made, Options())) if s.subject == "Law of errors")
+    assert "maximum likelihood under the modulated_normal law" in text
+    assert "NOT resistant to gross errors" in text
+    assert "not applicable under a law of errors" in text

@@ -193,3 +193,15 @@ def test_aerial_project_reads_back(tmp_path):
     write(block.network, tmp_path / "p")
     again = baarda.read(tmp_path / "p")
     assert np.array_equal(again.observations[0].xy, block.network.observations[0].xy)
+
+
+def test_a_test_that_misses_its_level_is_named(planned):
+    """The sentence counts the tests that hold among all that were told, and names the others."""
+    proof = prove(simulate(planned, 8, seed=4))
+    told = next(p for p in proof.sizes if p.name == "data_snooping (a priori)")
+    good = replace(told, name="good", z=0.5)
+    bad = replace(told, name="bad", rate=0.3, expected=0.1, z=9.0)
+    from baarda.report.simulation_verdict import sentences
+
+    text = next(s.text for s in sentences(planned, replace(proof, sizes=(good, bad))) if s.subject == "sizes")
+    assert text == "1 of 2 tests of true hypotheses reject as often as their level says; not so: bad (30 % instead of 10 %)."

@@ -321,16 +321,14 @@ class _NodeBlocks:
 
 
 def _sizes(structure: Structure, arrays: Blocks) -> Ints:
-    """Return the sizes of the buffers: rows of a point, Y, the square of a cluster, touched parts of a point."""
+    """Return the sizes of buffers: rows of a point, Y, the square of a cluster, touched parts of a point; parts, rows, width of a block."""
     width = np.diff(structure.first_column)
     height = np.where(structure.sparse, 3, 3 * np.diff(structure.first_point))
-    most_rows = int(arrays.table[:, 0].max(initial=1))
-    most_parts = int(arrays.table[:, 1].max(initial=1))
-    rows = structure.most_rows
-    return np.array(
-        [rows * most_rows + 6, int((width * height).max(initial=1)), int((width**2).max(initial=1)), 2 * rows * most_parts + 2],
-        dtype=np.intp,
-    )
+    largest = [int(a.max(initial=1)) for a in (width * height, width**2)]
+    table = arrays.table
+    rows, parts, widest = (int(a.max(initial=1)) for a in (table[:, 0], table[:, 1], table[:, 5::3]))
+    most = structure.most_rows
+    return np.array([most * rows + 6, *largest, 2 * most * parts + 2, parts, rows, widest], dtype=np.intp)
 
 
 def _orphans(structure: Structure) -> Ints:

@@ -158,6 +158,7 @@ def _accumulate(clusters: Ints, front: Floats, b: Blocks, r: Floats, bad: NDArra
     buffer = np.empty(size[1])
     square = np.empty(size[2])
     stack = np.empty(size[3], np.int64)
+    line = np.empty((size[4], size[5], size[6]))
     for c in clusters:
         first, last = b.first_point[c], b.first_point[c + 1]
         offset = b.first_column[c]
@@ -198,21 +199,22 @@ def _accumulate(clusters: Ints, front: Floats, b: Blocks, r: Floats, bad: NDArra
                             touched += 2
                     for e in range(m):
                         for x in range(w):
-                            h = b.values[base + e * w + x] * inverse[s + x]
-                            for a in range(3):
-                                y[k + a, s + x] += q[n + e, a] * h
+                            line[j, e, x] = b.values[base + e * w + x] * inverse[s + x]
+                        for a in range(3):
+                            for x in range(w):
+                                y[k + a, s + x] += q[n + e, a] * line[j, e, x]
+                for j in range(parts):
+                    s, w = b.starts[place + j], t[5 + 3 * j]
+                    if t[6 + 3 * j] == 0 or s < 0:
+                        continue
                     for j2 in range(parts):
-                        s2 = b.starts[place + j2]
+                        s2, w2 = b.starts[place + j2], t[5 + 3 * j2]
                         if t[6 + 3 * j2] == 0 or s2 < 0 or s2 > s:
                             continue
-                        w2 = t[5 + 3 * j2]
-                        base2 = t[4 + 3 * j2] + b.row[i] * m * w2
                         for x in range(w):
-                            for x2 in range(w2):
-                                total = 0.0
-                                for e in range(m):
-                                    total += b.values[base + e * w + x] * b.values[base2 + e * w2 + x2]
-                                own[s + x, s2 + x2] += total * inverse[s + x] * inverse[s2 + x2]
+                            for e in range(m):
+                                for x2 in range(w2):
+                                    own[s + x, s2 + x2] += line[j, e, x] * line[j2, e, x2]
                 n += m
             if sparse:
                 for g in range(0, touched, 2):
@@ -241,6 +243,7 @@ def _statistics(clusters: Ints, z: Floats, b: Blocks, hat: Floats, points: Float
     square = np.empty(size[2])
     stack = np.empty(size[3], np.int64)
     mixed = np.empty((3, size[0]))
+    line = np.empty((size[4], size[5], size[6]))
     for c in clusters:
         first, last = b.first_point[c], b.first_point[c + 1]
         offset = b.first_column[c]
@@ -349,20 +352,27 @@ def _statistics(clusters: Ints, z: Floats, b: Blocks, hat: Floats, points: Float
                         base = t[4 + 3 * j] + b.row[i] * m * w
                         for e in range(m):
                             for x in range(w):
-                                h = b.values[base + e * w + x] * inverse[s + x]
-                                for a in range(3):
-                                    mixed[a, e] += t_all[k + a, s + x] * h
+                                line[j, e, x] = b.values[base + e * w + x] * inverse[s + x]
+                            for a in range(3):
+                                total = 0.0
+                                for x in range(w):
+                                    total += t_all[k + a, s + x] * line[j, e, x]
+                                mixed[a, e] += total
+                    for j in range(parts):
+                        s, w = b.starts[place + j], t[5 + 3 * j]
+                        if t[6 + 3 * j] == 0 or s < 0:
+                            continue
+                        for x in range(w):
+                            for e2 in range(m):
+                                total = 0.0
                                 for j2 in range(parts):
                                     s2 = b.starts[place + j2]
                                     if t[6 + 3 * j2] == 0 or s2 < 0:
                                         continue
-                                    w2 = t[5 + 3 * j2]
-                                    base2 = t[4 + 3 * j2] + b.row[i] * m * w2
-                                    for e2 in range(m):
-                                        total = 0.0
-                                        for x2 in range(w2):
-                                            total += local[s + x, s2 + x2] * b.values[base2 + e2 * w2 + x2] * inverse[s2 + x2]
-                                        hat[out + e * m + e2] += h * total
+                                    for x2 in range(t[5 + 3 * j2]):
+                                        total += local[s + x, s2 + x2] * line[j2, e2, x2]
+                                for e in range(m):
+                                    hat[out + e * m + e2] += line[j, e, x] * total
                     for e in range(m):
                         for e2 in range(m):
                             total = 0.0

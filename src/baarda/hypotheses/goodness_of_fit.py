@@ -370,7 +370,8 @@ def normal_against_modulated(
     Notes
     -----
     The normal is the bound a = inf of the family, and the best a is infinite in more than half of all normal samples: the statistic is
-    not chi-square, hence the simulation.
+    not chi-square, hence the simulation. Values and simulated values are searched in the same way, so that the level holds; with a free
+    mean the search may stop some tenths short of the maximum of `fit`.
 
     Examples
     --------

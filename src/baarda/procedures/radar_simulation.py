@@ -75,9 +75,9 @@ def flight(middle: Sequence[float], height: float, direction: float, side: int, 
     Examples
     --------
     >>> flight((0.0, 0.0), 7000.0, 0.0, -1, order=1).round(1)
-    array([[-11380. , 0. ],
-           [ 0. , 120. ],
-           [ 7000. , 0. ]])
+    array([[-11379.4,      0. ],
+           [     0. ,    120. ],
+           [  7000. ,      0. ]])
     """
     forward = np.array([np.sin(direction), np.cos(direction)])
     left = np.array([-forward[1], forward[0]])

@@ -202,7 +202,7 @@ def space(scene: Scene, name: str = "block-in-space", most_ellipses: int = 60) -
         from matplotlib.collections import EllipseCollection, LineCollection
 
         axes = figure.add_subplot()
-        many = len(xy) > MOST_MARKS // 2
+        many = len(xy) > MOST_MARKS
         if len(scene.rays):
             lines = np.stack([ends[scene.rays[:, 0], 0], xy[scene.rays[:, 1]]], axis=1)
             axes.add_collection(

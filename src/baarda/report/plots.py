@@ -22,7 +22,7 @@ INK, MUTED, LINE = "#24292f", "#656d76", "#c8ced6"
 # Okabe & Ito: told apart without red-green vision; line styles differ as well.
 BLUE, ORANGE, GREEN, PURPLE = "#0072b2", "#d55e00", "#009e73", "#b0568f"
 FONTS = "system-ui, 'Segoe UI', 'Liberation Sans', Arial, sans-serif"
-MOST_MARKS = 5000  # beyond, marks are drawn as a picture
+MOST_MARKS = 2000  # beyond, marks are drawn as a picture
 
 _STYLE: dict[str, Any] = {
     "svg.fonttype": "none",
