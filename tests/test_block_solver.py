@@ -442,7 +442,7 @@ def test_cut_out_of_real_images(data, monkeypatch):
 @pytest.mark.parametrize("name", ["aerial", "joined points", "dense", "several groups"])
 def test_threads_change_no_bit(name, loops, monkeypatch):
     network = NETWORKS[name]()
-    monkeypatch.setattr("baarda.adjustment.linearize.PIECE", 97)
+    monkeypatch.setattr("baarda.adjustment.linear_system.PIECE", 97)
     monkeypatch.setattr("baarda.observations.image_points.CHUNK", 101)
     results = []
     for count in (1, 2, 3):

@@ -20,7 +20,7 @@ from scipy.sparse.linalg import LinearOperator, onenormest
 from baarda.adjustment import lapack
 from baarda.adjustment.dense import refuse_null_space
 from baarda.adjustment.kernels import Blocks, Kernels, blocks_of, kernels
-from baarda.adjustment.linearize import Linearization
+from baarda.adjustment.linear_system import Linearization
 from baarda.adjustment.structure import Front, Structure
 from baarda.adjustment.workers import run_tree
 from baarda.errors import Singular

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from baarda.adjustment.linearize import Linearization
+from baarda.adjustment.linear_system import Linearization
 from baarda.geometry.rotation import skew
 from baarda.network import State, Unknowns
 

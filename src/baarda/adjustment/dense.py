@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from baarda.adjustment.linearize import Linearization
+from baarda.adjustment.linear_system import Linearization
 from baarda.errors import Singular
 
 Floats = NDArray[np.float64]

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from baarda.adjustment.linearize import Linearization
+from baarda.adjustment.linear_system import Linearization
 from baarda.adjustment.structure import Structure
 
 Floats = NDArray[np.float64]

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from baarda.adjustment.datum import Datum
-from baarda.adjustment.linearize import Arrangement, Linearization, linearize, whitened_misclosures
+from baarda.adjustment.linear_system import Linearization
+from baarda.adjustment.linearize import Arrangement, linearize, whitened_misclosures
 from baarda.adjustment.result import Iteration
 from baarda.adjustment.solver import Solver
 from baarda.distributions.base import Distribution

@@ -14,7 +14,8 @@ from threadpoolctl import threadpool_limits
 from baarda.adjustment import tables
 from baarda.adjustment.covariance import Cofactors
 from baarda.adjustment.datum import Datum
-from baarda.adjustment.linearize import Linearization, offsets_of
+from baarda.adjustment.linear_system import Linearization
+from baarda.adjustment.linearize import offsets_of
 from baarda.adjustment.solver import Solver
 from baarda.errors import UsageError
 from baarda.geometry import rotation as rot

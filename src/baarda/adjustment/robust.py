@@ -17,7 +17,8 @@ from scipy import optimize
 
 from baarda.adjustment.datum import Datum
 from baarda.adjustment.likelihood import iterate
-from baarda.adjustment.linearize import Arrangement, Linearization
+from baarda.adjustment.linear_system import Linearization
+from baarda.adjustment.linearize import Arrangement
 from baarda.adjustment.result import Iteration
 from baarda.adjustment.solver import Solver
 from baarda.distributions import law as find_law

@@ -16,7 +16,8 @@ from baarda.adjustment.camera_choice import with_cameras
 from baarda.adjustment.datum import Datum, Defect, find_defect, minimal_columns
 from baarda.adjustment.dense import DenseSolver
 from baarda.adjustment.initial import complete
-from baarda.adjustment.linearize import Arrangement, Linearization, check_finite, linearize, whitened_misclosures
+from baarda.adjustment.linear_system import Linearization
+from baarda.adjustment.linearize import Arrangement, check_finite, linearize, whitened_misclosures
 from baarda.adjustment.result import Adjustment, Iteration
 from baarda.adjustment.robust import adjust_under_law, check_law
 from baarda.adjustment.solver import Solver
@@ -421,7 +422,7 @@ def _extrapolated(change: Floats, before: Floats) -> float:
     product, square = float(change @ before), float(before @ before)
     rate = product / square
     alike = product**2 > 0.8 * square * float(change @ change)
-    return 1.0 / (1.0 - rate) if alike and 0.1 < abs(rate) < 0.8 else 1.0
+    return 1.0 / (1.0 - rate) if alike and 0.1 < abs(rate) < 0.97 else 1.0
 
 
 def centres_of_rays(groups: Sequence[Kind], state: State) -> Floats:

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 
 from baarda.adjustment.dissection import dissect
-from baarda.adjustment.linearize import Chunk, Linearization, kept_positions
+from baarda.adjustment.linear_system import Chunk, Linearization
+from baarda.adjustment.linearize import kept_positions
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baarda.adjustment import Adjustment, adjust
-from baarda.adjustment.linearize import Linearization
+from baarda.adjustment.linear_system import Linearization
 from baarda.errors import UsageError
 from baarda.geometry import rotation as rot
 from baarda.hypotheses.base import Evidence, TestResult

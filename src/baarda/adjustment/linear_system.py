@@ -1,0 +1,237 @@
+"""The whitened linear system l + v = A x at one state, in chunks of row blocks, and its products with vectors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from baarda.adjustment.vector_loops import vector_loops
+from baarda.adjustment.workers import for_each
+from baarda.errors import UsageError
+from baarda.network import UnknownGroup, Unknowns
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+PIECE = 16384  # row blocks handled by one task
+FEW = 100_000  # observations up to which many vectors at once are multiplied by the sparse matrix
+
+
+@dataclass(frozen=True)
+class Part:
+    """The columns of one unknown group in a chunk: nodes (N,), the positions (w,) kept of each node, whitened partials (N, m, w).
+
+    Positions are kept where any node of this kind and width has an unknown; where a node has none, its column is -1. The partials are
+    a view of the values of the linearization, from `start`.
+    """
+
+    group: UnknownGroup
+    nodes: Ints
+    positions: Ints
+    jacobian: Floats
+    start: int
+
+    @property
+    def kind(self) -> str:
+        """The unknown group."""
+        return self.group.kind
+
+    @property
+    def columns(self) -> Ints:
+        """The (N, w) columns."""
+        return self.columns_of(slice(None))
+
+    def columns_of(self, rows: Any) -> Ints:
+        """Return the (n, w) columns of some row blocks."""
+        return np.asarray(self.table[self.nodes[rows]])
+
+    @cached_property
+    def table(self) -> Ints:
+        """The (nodes, w) columns of all nodes of the group; of no meaning for nodes of another width."""
+        last = max(len(self.group.columns) - 1, 0)
+        return np.asarray(self.group.columns[np.minimum(self.group.offsets[:-1, None] + self.positions, last)])
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Whitened row blocks: first scalar row (N,), misclosures (N, m), parts, and the factors L (N, m, m) of the cofactors Q = L L'.
+
+    Of a combined model with fewer conditions than observations, `controlled` (N, m, m) projects onto what the conditions control.
+    """
+
+    first: Ints
+    misclosure: Floats
+    parts: tuple[Part, ...]
+    factor: Floats
+    controlled: Floats | None = None
+
+    @property
+    def rows(self) -> Ints:
+        """The (N, m) scalar rows."""
+        return np.asarray(self.first[:, None] + np.arange(self.misclosure.shape[1]))
+
+    @property
+    def correlated(self) -> bool:
+        """Whether rows of a block are correlated."""
+        factor = self.factor[:1] if self.factor.strides[0] == 0 else self.factor
+        return factor.shape[1] > 1 and bool(np.any(np.tril(factor, -1)))
+
+    def pieces(self) -> list[slice]:
+        """Return slices of row blocks that one task handles."""
+        return [slice(a, a + PIECE) for a in range(0, len(self.first), PIECE)]
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """The whitened linear system l + v = A x at one state.
+
+    Attributes
+    ----------
+    unknowns : Unknowns
+    chunks : tuple of Chunk
+    count : int
+        Number n of scalar observations.
+    values : array
+        The partials of all chunks and parts, one after the other.
+    workers : int or None
+        Number of threads; None = one for each core. Nothing depends on it but the time.
+    """
+
+    unknowns: Unknowns
+    chunks: tuple[Chunk, ...]
+    count: int
+    values: Floats
+    workers: int | None = None
+
+    @cached_property
+    def uncontrolled(self) -> int:
+        """How many combinations of observations no condition controls: they have no redundancy."""
+        return round(sum(c.misclosure.size - float(np.einsum("nii->", c.controlled)) for c in self.chunks if c.controlled is not None))
+
+    def weighted(self, roots: Floats) -> Linearization:
+        """Return the system with its rows multiplied by the roots of their weights, (n,).
+
+        Raises
+        ------
+        UsageError
+            If a combined model with fewer conditions than observations is in it.
+        """
+        if self.uncontrolled:
+            raise UsageError("a combined model with fewer conditions than observations cannot be adjusted under a law of errors")
+        values = np.empty_like(self.values)
+        chunks = []
+        for c in self.chunks:
+            w = roots[c.rows]
+            parts = []
+            for p in c.parts:
+                view = values[p.start : p.start + p.jacobian.size].reshape(p.jacobian.shape)
+                np.multiply(p.jacobian, w[:, :, None], out=view)
+                parts.append(replace(p, jacobian=view))
+            chunks.append(replace(c, misclosure=c.misclosure * w, parts=tuple(parts)))
+        return replace(self, chunks=tuple(chunks), values=values)
+
+    @cached_property
+    def misclosure(self) -> Floats:
+        """The whitened misclosures, (n,)."""
+        out = np.empty(self.count)
+        for c in self.chunks:
+            out[c.rows] = c.misclosure
+        return out
+
+    @cached_property
+    def design(self) -> Any:
+        """The whitened design matrix, (n, u), sparse by rows: for small systems and as an oracle; `times` and `transposed` need no copy."""
+        rows, columns, values = [], [], []
+        for c in self.chunks:
+            for part in c.parts:
+                shape = part.jacobian.shape
+                column = np.broadcast_to(part.columns[:, None, :], shape)
+                used = column >= 0
+                rows.append(np.broadcast_to(c.rows[:, :, None], shape)[used])
+                columns.append(column[used])
+                values.append(part.jacobian[used])
+        if not rows:
+            return sparse.csr_array((self.count, self.unknowns.count))
+        coordinates = (np.concatenate(rows), np.concatenate(columns))
+        return sparse.coo_array((np.concatenate(values), coordinates), shape=(self.count, self.unknowns.count)).tocsr()
+
+    def times(self, x: Floats, kinds: Container[str] | None = None) -> Floats:
+        """Return A x for (u,) or (u, k) vectors; with `kinds` only of the parts of these unknown groups."""
+        if x.ndim == 2 and self.count <= FEW and kinds is None:
+            return np.asarray(self.design @ x)
+        if x.ndim == 2 and x.shape[1] == 1:
+            return self.times(x[:, 0], kinds)[:, None]
+        padded = np.concatenate([x, np.zeros((1, *x.shape[1:]))])
+        out = np.zeros((self.count, *x.shape[1:]))
+        loops = vector_loops(self.count)
+        multiply = loops.times if x.ndim == 1 else loops.times_many
+
+        def product(c: Chunk, some: slice) -> None:
+            for part in c.parts:
+                if kinds is None or part.kind in kinds:
+                    multiply(part.jacobian[some], part.nodes[some], part.table, padded, c.first[some], out)
+
+        self._each(product)
+        return out
+
+    def row_sums(self, weights: Floats) -> Floats:
+        """Return sum_j A_ij^2 weights_j of each row i, (n,)."""
+        padded = np.append(weights, 0.0)
+        out = np.zeros(self.count)
+
+        def sums(c: Chunk, some: slice) -> None:
+            m = c.misclosure.shape[1]
+            total = sum(np.einsum("nmw,nmw,nw->nm", p.jacobian[some], p.jacobian[some], padded[p.columns_of(some)]) for p in c.parts)
+            out[c.first[some][:, None] + np.arange(m)] = total
+
+        self._each(sums)
+        return out
+
+    def transposed(self, y: Floats, kinds: Container[str] | None = None) -> Floats:
+        """Return A' y for (n,) or (n, k) vectors; with `kinds` only the rows of these unknown groups, the others zero."""
+        if y.ndim == 2 and self.count <= FEW and kinds is None:
+            return np.asarray(self.design.T @ y)
+        if y.ndim == 2 and y.shape[1] == 1:
+            return self.transposed(y[:, 0], kinds)[:, None]
+        return self._gathered(y, kinds, squared=False)
+
+    def column_sums(self, weights: Floats) -> Floats:
+        """Return sum_i weights_i A_ij^2 of each column j, (u,)."""
+        return self._gathered(weights, None, squared=True)
+
+    def _gathered(self, y: Floats, kinds: Container[str] | None, squared: bool) -> Floats:
+        """Add up what the row blocks contribute to their columns, part by part."""
+        loops = vector_loops(self.count)
+        parts = [(c, p) for c in self.chunks for p in c.parts if kinds is None or p.kind in kinds]
+        y = np.ascontiguousarray(y)
+
+        def contribute(i: int) -> Floats:
+            c, part = parts[i]
+            own = np.zeros((self.unknowns.count + 1, *y.shape[1:]))
+            if y.ndim == 1:
+                loops.gathered(part.jacobian, part.nodes, part.table, y, c.first, squared, own)
+            else:
+                loops.gathered_many(part.jacobian, part.nodes, part.table, y, c.first, own)
+            return own
+
+        out = np.zeros((self.unknowns.count + 1, *y.shape[1:]))
+        for own in for_each(range(len(parts)), contribute, self.workers):
+            out += own
+        return out[:-1]
+
+    def _each(self, function: Callable[[Chunk, slice], None]) -> None:
+        for c in self.chunks:
+            for _ in for_each(c.pieces(), partial(function, c), self.workers):
+                pass
+
+    @cached_property
+    def scale(self) -> Floats:
+        """The Euclidean norms of the columns of the design matrix, (u,); 1 where a column is zero."""
+        norms = np.sqrt(self.column_sums(np.ones(self.count)))
+        return np.where(norms > 0.0, norms, 1.0)
