@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from baarda.errors import Singular, UsageError
 from baarda.hypotheses.base import TestResult
-from baarda.hypotheses.deformation import pooled_variance_factor
-from baarda.hypotheses.parameter_groups import equal_parameters
+from baarda.hypotheses.parameter_groups import equal_parameters, equal_parameters_of_epochs
 from baarda.hypotheses.parameters import general_linear
 from baarda.hypotheses.variance_inflation import ConditionIndices, condition_indices, mutual_inflation, variance_inflation
 
@@ -166,11 +165,11 @@ def equal_epochs(
             raise UsageError(f"{missing[0]!r} is not an estimated camera parameter; known are {', '.join(estimates.names)}")
         at = np.array([estimates.names.index(n) for n in names])
         taken.append((estimates.values[at], estimates.cofactors[np.ix_(at, at)]))
-    factor, r = (1.0, np.inf)
-    if sigma == "aposteriori":
-        factor, r = pooled_variance_factor(first.variance_factor, first.redundancy, second.variance_factor, second.redundancy)
     names = [a for a, _ in couples]
-    return equal_parameters(*taken[0], *taken[1], factor, r, None, alpha, names, "equal_epochs")
+    if sigma == "apriori":
+        return equal_parameters(*taken[0], *taken[1], 1.0, np.inf, None, alpha, names, "equal_epochs")
+    own = [(*pair, a.variance_factor, a.redundancy) for pair, a in zip(taken, (first, second), strict=True)]
+    return equal_parameters_of_epochs(*own[0], *own[1], alpha, names)
 
 
 def _judge(adjustment: Adjustment, sigma: Sigma) -> tuple[float, float]:

@@ -14,7 +14,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
 WIDTH = 192  # right-hand sides at once
-MOST = 1e9  # numbers solved for in all; beyond, object points and images are left out (cameras never)
+MOST = 1e7  # numbers solved for in all; beyond, object points and images are left out
+MOST_FELT = 2e9  # effects on all observations computed in all; beyond, cameras are left out too
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,9 @@ def external_effects(a: Adjustment, biases: Floats) -> Effects:
     n = a.count
     values, ratios, column = np.full(n, np.nan), np.full(n, -1.0), np.full(n, -1, dtype=np.intp)
     complete = 1.0 * a.numbering.count**2 <= MOST
+    cameras = int((a.numbering["camera"].columns >= 0).sum())
+    if not complete and 1.0 * cameras * n > MOST_FELT:
+        return Effects(values, np.full(n, "", dtype=object), values.copy(), complete)
     for c in a.lin.chunks:
         weighted = np.linalg.inv(c.factor).transpose(0, 2, 1)
         for part in c.parts:
@@ -74,7 +78,8 @@ def external_effects(a: Adjustment, biases: Floats) -> Effects:
                 unit[free, np.arange(len(free))] = 1.0
                 with threadpool_limits(limits=1, user_api="blas"):
                     q = a.cofactors.solve(unit)
-                    felt = np.asarray(a.lin.design[c.rows[some].ravel()] @ q)
+                    rows = c.rows[some].ravel()
+                    felt = np.asarray(a.lin.design[rows] @ q if complete else a.lin.times(q)[rows])
                 sigma = np.sqrt(q[free, np.arange(len(free))])
                 m, w = c.rows.shape[1], columns.shape[1]
                 place = inverse - (len(at) - len(free))  # -1 for a fixed parameter
