@@ -106,7 +106,12 @@ def _build(analysis: Analysis) -> list[Block] | None:
         Column("error", "", "estimated gross error, observed - true = -v / r"),
         Column("MDB", "", say("minimal detectable bias with power {power}", power=fixed(o.power, 2))),
         Column("external", "", "effect of an undetected error of that size on the unknowns, in their standard deviations at most"),
-        Column("effect", "", "the largest of these effects on an unknown of its camera, image or points (in large blocks: of its camera), in its unit", "left"),
+        Column(
+            "effect",
+            "",
+            "the largest of these effects on an unknown of its camera, image or points (in large blocks: of its camera), in its unit",
+            "left",
+        ),
         Column("p", "", say("probability of a |{name}| as large without gross error", name=name)),
         Column("at point", "", "further observations suspected at the same point"),
         Column("in image", "", "further observations suspected in the same image"),
