@@ -275,6 +275,10 @@ def compare(s, solver, damping=0.0):
     several = np.column_stack([s.rhs, np.cos(np.arange(len(s.rhs))) * s.lin.scale])
     both = solver.solve(several)
     assert (np.abs(both[:, 0] - x) <= tolerance * np.maximum(moved, 1e-300) * max(np.linalg.norm(s.lin.misclosure), 1.0)).all()
+    y = np.cos(np.arange(s.lin.count))
+    step, change = solver.least_squares(y)
+    assert (np.abs(step - inverse @ s.lin.transposed(y)) <= tolerance * np.maximum(moved, 1e-300) * np.linalg.norm(y)).all()
+    assert np.abs(change - s.lin.times(step)).max() <= 1e-10 * np.linalg.norm(y)
     exact = inverse @ several[:, 1]
     assert (np.abs(both[:, 1] - exact) <= tolerance * np.maximum(moved, 1e-300) * np.linalg.norm(several[:, 1] * moved)).all()
     return cond
@@ -444,6 +448,7 @@ def test_threads_change_no_bit(name, loops, monkeypatch):
     network = NETWORKS[name]()
     monkeypatch.setattr("baarda.adjustment.linear_system.PIECE", 97)
     monkeypatch.setattr("baarda.observations.image_points.CHUNK", 101)
+    monkeypatch.setattr("baarda.adjustment.structure.TASK", 103)
     results = []
     for count in (1, 2, 3):
         monkeypatch.setattr(workers, "worker_count", lambda _, count=count: count)

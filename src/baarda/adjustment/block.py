@@ -19,10 +19,11 @@ from scipy.sparse.linalg import LinearOperator, onenormest
 
 from baarda.adjustment import lapack
 from baarda.adjustment.dense import refuse_null_space
-from baarda.adjustment.kernels import Blocks, Kernels, blocks_of, kernels
+from baarda.adjustment.kernels import Kernels, kernels
 from baarda.adjustment.linear_system import Linearization
+from baarda.adjustment.row_blocks import Blocks, blocks_of, sizes
 from baarda.adjustment.structure import Front, Structure
-from baarda.adjustment.workers import run_tree
+from baarda.adjustment.workers import for_each, run_tree
 from baarda.errors import Singular
 
 Floats = NDArray[np.float64]
@@ -70,7 +71,7 @@ class BlockSolver:
         inverse[held] = 0.0
         arrays = blocks_of(lin, structure, inverse, damping)
         loops = kernels(len(structure.block_row))
-        size = _sizes(structure, arrays)
+        size = sizes(structure, arrays)
         triangles = np.zeros((len(structure.points), 3, 3))
         bad = np.zeros(len(structure.points), dtype=bool)
         panels: list[Floats | None] = [None] * len(structure.fronts)
@@ -141,6 +142,53 @@ class BlockSolver:
         coupled = self._scaled_transposed(self.lin.times(x[:-1], self._reduced_kinds), {"point"})
         x[own] = (z - self._points(coupled[own])) * self.inverse[own][:, :, None]
         return np.asarray(x[:-1].reshape(rhs.shape))
+
+    def least_squares(self, y: Floats) -> tuple[Floats, Floats]:
+        """Return x = N^-1 A'y for an (n,) vector in the place of the whitened observations, and A x."""
+        if not self.loops.compiled:
+            x = self.solve(self.lin.transposed(y))
+            return x, self.lin.times(x)
+        s, arrays = self.structure, self.blocks_
+        order = np.append(s.order, -1)  # for rows that end at a parameter that is fixed
+
+        def forward(task: tuple[int, Ints]) -> Floats:
+            f, clusters = task
+            out = np.zeros(len(s.fronts[f].columns) if f >= 0 else 0)
+            self.loops.forward(clusters, y, arrays, self.triangles, out)
+            return out
+
+        reduced = np.zeros(len(order))
+        for (f, _), own in zip(s.tasks, for_each(s.tasks, forward, self.lin.workers), strict=True):
+            if f >= 0:
+                reduced[s.fronts[f].columns] += own
+        rest = [(self.lin.chunks[e.chunk], e) for e in s.rest]
+        at = [np.where(e.at >= 0, self._columns_of_fronts[e.front[:, None], e.at], len(order) - 1) for _, e in rest]
+        for (c, e), columns in zip(rest, at, strict=True):
+            h = _scaled(c, e.rows, self.inverse)
+            reduced += np.bincount(columns.ravel(), np.einsum("nmw,nm->nw", h, y[c.rows[e.rows]]).ravel(), len(order))
+        solution = np.append(self.solve_reduced(reduced[:-1, None])[:, 0], 0.0)
+        points, change = np.zeros((len(s.points), 3)), np.zeros(len(y))
+
+        def backward(task: tuple[int, Ints]) -> None:
+            self.loops.backward(task[1], solution, y, arrays, self.triangles, points, change)
+
+        for _ in for_each(s.tasks, backward, self.lin.workers):
+            pass
+        for (c, e), columns in zip(rest, at, strict=True):
+            change[c.rows[e.rows]] = np.einsum("nmw,nw->nm", _scaled(c, e.rows, self.inverse), solution[columns])
+        x = np.zeros(len(self.inverse))
+        x[order[:-1]] = solution[:-1] * self.inverse[order[:-1]]
+        x[s.point_columns] = points
+        return x[:-1], change
+
+    @cached_property
+    def _columns_of_fronts(self) -> Ints:
+        """The columns of all fronts, (fronts, widest), in the order of elimination."""
+        fronts = self.structure.fronts
+        out = np.full((len(fronts), max((len(f.columns) for f in fronts), default=1)), -1)
+        for row, front in zip(out, fronts, strict=True):
+            row[: len(front.columns)] = front.columns
+        return out
 
     @cached_property
     def _reduced_kinds(self) -> set[str]:
@@ -318,17 +366,6 @@ class _NodeBlocks:
             weight = np.where(at[rows] >= 0, self.inverse[columns[rows]], 0.0)
             out[rows] = self.own[f][local[:, :, None], local[:, None, :]] * weight[:, :, None] * weight[:, None, :]
         return out
-
-
-def _sizes(structure: Structure, arrays: Blocks) -> Ints:
-    """Return the sizes of buffers: rows of a point, Y, the square of a cluster, touched parts of a point; parts, rows, width of a block."""
-    width = np.diff(structure.first_column)
-    height = np.where(structure.sparse, 3, 3 * np.diff(structure.first_point))
-    largest = [int(a.max(initial=1)) for a in (width * height, width**2)]
-    table = arrays.table
-    rows, parts, widest = (int(a.max(initial=1)) for a in (table[:, 0], table[:, 1], table[:, 5::3]))
-    most = structure.most_rows
-    return np.array([most * rows + 6, *largest, 2 * most * parts + 2, parts, rows, widest], dtype=np.intp)
 
 
 def _orphans(structure: Structure) -> Ints:

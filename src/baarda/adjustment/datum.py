@@ -76,6 +76,9 @@ def similarity_directions(unknowns: Unknowns, state: State) -> Floats:
     return out
 
 
+SAMPLE = 10_000  # row blocks of a chunk that are looked at first
+
+
 def find_defect(lin: Linearization, state: State, tolerance: float = 1e-18) -> Defect:
     """Find the transformations that change no observation.
 
@@ -91,6 +94,12 @@ def find_defect(lin: Linearization, state: State, tolerance: float = 1e-18) -> D
     Defect
     """
     g = similarity_directions(lin.unknowns, state)
+    if lin.count > 8 * SAMPLE and not _defect_of(lin.sample(SAMPLE), g, tolerance).count:
+        return Defect(np.zeros((len(g), 0)), ())  # what some rows determine is determined
+    return _defect_of(lin, g, tolerance)
+
+
+def _defect_of(lin: Linearization, g: Floats, tolerance: float) -> Defect:
     # Rows are brought to one size: what changes no observation does so whatever the weights are, and a weak observation must not drown.
     size = lin.row_sums((g**2).sum(axis=1))
     weight_of_row = np.divide(1.0, np.sqrt(size), out=np.zeros_like(size), where=size > 0.0)

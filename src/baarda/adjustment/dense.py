@@ -53,6 +53,11 @@ class DenseSolver:
         out[self.kept] = linalg.cho_solve((self.factor, True), columns[self.kept] / self.scale[:, None]) / self.scale[:, None]
         return out.reshape(rhs.shape)
 
+    def least_squares(self, y: Floats) -> tuple[Floats, Floats]:
+        """Return x = N^-1 A'y for an (n,) vector in the place of the whitened observations, and A x."""
+        x = self.solve(self.lin.transposed(y))
+        return x, self.lin.times(x)
+
     def hat(self) -> list[Floats]:
         """Return for each chunk the (N, m, m) diagonal blocks of A N^-1 A'."""
         inverse = self._inverse

@@ -136,6 +136,33 @@ class Linearization:
             chunks.append(replace(c, misclosure=c.misclosure * w, parts=tuple(parts)))
         return replace(self, chunks=tuple(chunks), values=values)
 
+    def sample(self, most: int) -> Linearization:
+        """Return a part of the rows: at most some `most` row blocks of each chunk, those that end at a fixed parameter first.
+
+        What is determined by these rows is determined by all.
+        """
+        chunks, values, at, count = [], [], 0, 0
+        for c in self.chunks:
+            rows = np.arange(len(c.first))
+            if len(rows) > most:
+                held = np.zeros(len(rows), dtype=bool)
+                for p in c.parts:
+                    if p.kind == "point":
+                        held |= np.any(p.table < 0, axis=1)[p.nodes]
+                ends = np.flatnonzero(held)
+                rows = np.unique(np.concatenate([ends[:: len(ends) // most + 1], rows[:: len(rows) // most + 1]]))
+            parts = []
+            for p in c.parts:
+                values.append(np.ascontiguousarray(p.jacobian[rows]))
+                parts.append(replace(p, nodes=p.nodes[rows], jacobian=values[-1], start=at))
+                at += values[-1].size
+            m = c.misclosure.shape[1]
+            controlled = None if c.controlled is None else c.controlled[rows]
+            chunks.append(Chunk(count + m * np.arange(len(rows)), c.misclosure[rows], tuple(parts), c.factor[rows], controlled))
+            count += m * len(rows)
+        joined = np.concatenate([np.zeros(0), *(v.ravel() for v in values)])
+        return Linearization(self.unknowns, tuple(chunks), count, joined, self.workers)
+
     @cached_property
     def misclosure(self) -> Floats:
         """The whitened misclosures, (n,)."""

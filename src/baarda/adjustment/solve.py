@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
@@ -16,8 +16,9 @@ from baarda.adjustment.camera_choice import with_cameras
 from baarda.adjustment.datum import Datum, Defect, find_defect, minimal_columns
 from baarda.adjustment.dense import DenseSolver
 from baarda.adjustment.initial import complete
+from baarda.adjustment.iteration import iterate
 from baarda.adjustment.linear_system import Linearization
-from baarda.adjustment.linearize import Arrangement, check_finite, linearize, whitened_misclosures
+from baarda.adjustment.linearize import Arrangement, check_finite, linearize
 from baarda.adjustment.result import Adjustment, Iteration
 from baarda.adjustment.robust import adjust_under_law, check_law
 from baarda.adjustment.solver import Solver
@@ -29,9 +30,6 @@ from baarda.observations import ImagePoints, Kind, direct_observations
 
 Floats = NDArray[np.float64]
 DENSE_LIMIT = 1500
-REUSE = 1e-4  # relative step below which the factor of the last iteration serves the next ones
-NEAR = 1e-3  # relative step below which a full step is not tried before it is taken
-BEND = 1e-7  # relative step above which steps are bent
 
 
 @dataclass(frozen=True)
@@ -184,7 +182,7 @@ def _adjust(network: Network, settings: Settings) -> Adjustment:
     datum = choose_datum(defect, lin, settings, prepared)
     given = [lin]
     del lin  # so that the iteration can let it go
-    state, lin, history, converged = _iterate(prepared, start, given.pop(), arranged, datum, factor, settings)
+    state, lin, history, converged = iterate(prepared, start, given.pop(), arranged, datum, factor, settings)
     law = None
     if settings.robust is not None:
         found = adjust_under_law(prepared, state, lin, arranged, datum, factor, settings, redundancy, history)
@@ -325,132 +323,3 @@ def choose_datum(defect: Defect, lin: Linearization, settings: Settings, network
         where, conditions = "all object points and images", defect.basis * on[:, None]
     text = f"Free network: {defect.count} inner constraint(s) over {where} tie down {free}."
     return Datum("inner", defect, held, conditions, text)
-
-
-def _iterate(
-    network: Network,
-    state: State,
-    lin: Linearization,
-    groups: Arrangement,
-    datum: Datum,
-    factor: Callable[..., Solver],
-    settings: Settings,
-) -> tuple[State, Linearization, list[Iteration], bool]:
-    """Gauss-Newton with Levenberg's damping where a full step does not help.
-
-    The damping follows Nielsen's rule (1999). Steps that shrink at a constant rate, as large residuals make them, are extrapolated
-    (Aitken); others are bent by the second derivative along them, solved with the same factor (geodesic acceleration: Transtrum &
-    Sethna 2012), so that narrow curved valleys of weak self-calibrations are followed, not crept along.
-    """
-    objective = float(lin.misclosure @ lin.misclosure)
-    floor = lin.count * 1e-8  # residuals of 1e-4 sigma count as none
-    history = [Iteration(0, objective, None, 0.0, True)]
-    damping, growth, last, curved = 0.0, 2.0, np.inf, False
-    stalled = 0
-    before: Floats | None = None  # the last full step, as a change of the observations
-
-    def moved(step: Floats) -> State:
-        return state.moved(unknowns, step, centres_of_rays(groups.groups, state))
-
-    def misclosures(step: Floats) -> tuple[State, Floats, float]:
-        trial = moved(step)
-        values = whitened_misclosures(network, trial, groups, workers)
-        with np.errstate(over="ignore"):
-            return trial, values, float(values @ values) if np.isfinite(values).all() else np.inf
-
-    tied, unknowns, workers = datum, lin.unknowns, lin.workers
-    untied = replace(datum, held=np.zeros(0, dtype=np.intp), conditions=None)  # damping ties the datum down by itself
-    solver: Solver | None = None
-    for count in range(1, settings.iterations + 1):
-        datum = untied if damping > 0.0 else tied
-        if solver is not None and damping == 0.0 and last <= REUSE:
-            solver = solver.at(lin)  # the system hardly differs from the one that was factored
-        else:
-            solver = factor(lin, datum, damping)
-        rhs = lin.transposed(lin.misclosure)
-        step = datum.transform(solver.solve(rhs))
-        change = lin.times(step)
-        predicted = 2.0 * float(step @ rhs) - float(change @ change)
-        relative = float(np.linalg.norm(change) / np.sqrt(max(objective, floor)))
-        lengthened = 1.0
-        if damping == 0.0 and before is not None and relative < 0.01:
-            lengthened = _extrapolated(change, before)
-            step, predicted = lengthened * step, 2.0 * lengthened * float(step @ rhs) - lengthened**2 * float(change @ change)
-        if lengthened == 1.0 and relative > max(BEND, 0.1 * last if np.isfinite(last) else 0.0):  # steps that shrink fast need no bending
-            step = _bent(lin, solver, datum, step, change, lambda x: misclosures(x)[1])
-        near = damping == 0.0 and relative <= NEAR
-        if near:  # sure to be taken: linearised at once
-            trial, solver = moved(step), solver.at(None)
-            del lin  # its memory is needed
-            lin = linearize(network, trial, unknowns, groups, workers)
-            with np.errstate(over="ignore"):
-                value = float(lin.misclosure @ lin.misclosure)
-        else:
-            trial, _, value = misclosures(step)
-        gain = (objective - value) / predicted if predicted > 0.0 else 0.0
-        at_rounding = relative < 1e-6 and abs(value - objective) <= 1e-9 * max(objective, floor)
-        accepted = bool(gain > 1e-4 or at_rounding)
-        history.append(Iteration(count, value if accepted else objective, relative, damping, accepted))
-        if settings.progress is not None:
-            settings.progress(history[-1])
-        if not accepted:
-            before = solver = None
-            if near:
-                lin = linearize(network, state, unknowns, groups, workers)
-            curved |= relative < 1e-3  # large residuals bend the problem so much that full steps fail even beside the solution
-            damping, growth, last = max(damping * growth, 1e-4 if relative > 0.1 else 1e-7), 2.0 * growth, np.inf
-            continue
-        state, objective = trial, value
-        before = change if damping == 0.0 and lengthened == 1.0 else None
-        solver = solver.at(None) if solver is not None and damping == 0.0 and relative <= REUSE else None
-        if not near:
-            del lin
-            lin = linearize(network, state, unknowns, groups, workers)
-        stalled = stalled + 1 if relative <= 1e-7 and relative >= 0.8 * last else 0
-        settled = relative <= settings.tolerance or stalled == 2 or (relative < 1e-9 and relative >= 0.5 * last)  # only rounding is left
-        if settled and (damping == 0.0 or _full_step(lin, tied, factor) <= 1e-6):
-            return state, lin, history, True
-        damping *= max(0.5 if curved else 0.2, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
-        if damping < 1e-9 or (relative < 1e-4 and not curved):
-            damping = 0.0
-        growth, last = 2.0, relative
-    return state, lin, history, False
-
-
-def _extrapolated(change: Floats, before: Floats) -> float:
-    """Return by how much to lengthen a step that repeats the last one at a constant rate (Aitken's extrapolation), else 1."""
-    product, square = float(change @ before), float(before @ before)
-    rate = product / square
-    alike = product**2 > 0.8 * square * float(change @ change)
-    return 1.0 / (1.0 - rate) if alike and 0.1 < abs(rate) < 0.97 else 1.0
-
-
-def centres_of_rays(groups: Sequence[Kind], state: State) -> Floats:
-    """Return for each point the mean place of the images that see it, NaN where none does."""
-    total, count = np.zeros((len(state.points), 3)), np.zeros(len(state.points))
-    for group in groups:
-        if isinstance(group, ImagePoints):
-            count += np.bincount(group.points, minlength=len(count))
-            for k in range(3):
-                total[:, k] += np.bincount(group.points, state.position[group.images, k], len(count))
-    with np.errstate(invalid="ignore"):
-        return np.asarray(total / count[:, None])
-
-
-def _full_step(lin: Linearization, datum: Datum, factor: Callable[..., Solver]) -> float:
-    """Return the relative step that would be taken without damping."""
-    change = lin.times(factor(lin, datum).solve(lin.transposed(lin.misclosure)))
-    return float(np.linalg.norm(change) / max(np.linalg.norm(lin.misclosure), 1e-4 * np.sqrt(lin.count)))
-
-
-def _bent(
-    lin: Linearization, solver: Solver, datum: Datum, step: Floats, change: Floats, misclosures: Callable[[Floats], Floats]
-) -> Floats:
-    """Add the second-order correction to a step, where it is smaller than the step."""
-    h = 0.1
-    curvature = 2.0 / h * ((lin.misclosure - misclosures(h * step)) / h - change)
-    if not np.isfinite(curvature).all():
-        return step
-    bend = -0.5 * datum.transform(solver.solve(lin.transposed(curvature)))
-    size = np.linalg.norm(lin.scale * bend) / np.linalg.norm(lin.scale * step)
-    return step + bend if size <= 0.375 else step

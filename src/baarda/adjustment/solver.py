@@ -24,6 +24,9 @@ class Solver(Protocol):
     def solve(self, rhs: Floats) -> Floats:
         """Return N^-1 rhs for (u,) or (u, k) right-hand sides."""
 
+    def least_squares(self, y: Floats) -> tuple[Floats, Floats]:
+        """Return x = N^-1 A'y for an (n,) vector in the place of the whitened observations, and A x."""
+
     def hat(self) -> list[Floats]:
         """Return for each chunk the (N, m, m) diagonal blocks of A N^-1 A'."""
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ BASE = 16  # points of the smallest cluster
 MOST = 1024  # points of the largest cluster
 LARGEST = 700_000  # points times columns of the largest cluster
 GROWTH = 1.1  # a cluster may grow while its width stays below this multiple of its widest part
+TASK = 20_000  # row blocks of one task
 SPARSE = 3.5  # clusters wider than this multiple of what a point of theirs touches are treated point by point
 
 
@@ -85,8 +87,8 @@ class Structure:
     first_block : (P + 1,) int array
     block_chunk, block_row : (B,) int32 arrays
         Row blocks sorted by inner point.
-    starts : tuple of (N, parts) int32 arrays
-        For each chunk where the columns of each part begin in its cluster, -1 = not there.
+    starts : int32 array
+        Chunk by chunk for each row block and part where its columns begin in its cluster, -1 = not there.
     point_part : tuple of int
         For each chunk which part is the inner point, -1 = none.
     first_point, first_column : (C + 1,) int arrays
@@ -108,7 +110,7 @@ class Structure:
     first_block: Ints
     block_chunk: Small
     block_row: Small
-    starts: tuple[Small, ...]
+    starts: Small
     point_part: tuple[int, ...]
     first_point: Ints
     first_column: Ints
@@ -117,6 +119,18 @@ class Structure:
     sparse: Bools
     fronts: tuple[Front, ...]
     rest: tuple[Rest, ...]
+
+    @cached_property
+    def tasks(self) -> list[tuple[int, Ints]]:
+        """Front and clusters of tasks of some size, which share nothing; clusters without a node belong to the front -1."""
+        blocks = np.diff(self.first_block[self.first_point])
+        out = []
+        orphans = np.flatnonzero(np.diff(self.first_column) == 0)
+        for f, clusters in [*((f, front.clusters) for f, front in enumerate(self.fronts)), (-1, orphans)]:
+            if len(clusters):
+                cuts = np.flatnonzero(np.diff(np.cumsum(blocks[clusters]) // TASK)) + 1
+                out += [(f, part) for part in np.split(clusters, cuts) if len(part)]
+        return out
 
     @property
     def most_rows(self) -> int:
@@ -253,7 +267,7 @@ def analyse(lin: Linearization, rank: Ints, coordinates: Floats) -> Structure:
         first_block=first_block,
         block_chunk=chunk,
         block_row=row,
-        starts=tuple(_starts(seen, part, chunk, row, first_block[first_point], members, widths, nodes.count)),
+        starts=_starts(seen, chunk, row, first_block[first_point], members, widths, nodes.count),
         point_part=part,
         first_point=first_point,
         first_column=first_column,
@@ -505,11 +519,11 @@ def _fronts(parts: list[Ints], front_nodes: list[Ints], home: Ints, nodes: _Node
     return tuple(out)
 
 
-def _starts(
-    seen: list[Ints], part: tuple[int, ...], chunk: Small, row: Small, first: Ints, members: list[Ints], widths: list[Ints], count: int
-) -> list[Small]:
-    """Return for each chunk where the columns of each part begin in the cluster of the block."""
-    out = [np.full(numbers.shape, -1, dtype=np.int32) for numbers in seen]
+def _starts(seen: list[Ints], chunk: Small, row: Small, first: Ints, members: list[Ints], widths: list[Ints], count: int) -> Small:
+    """Return for each chunk, one after the other, where the columns of each part begin in the cluster of the block."""
+    sizes = np.cumsum([0, *(numbers.size for numbers in seen)])
+    flat = np.full(sizes[-1], -1, dtype=np.int32)
+    out = [flat[a:b].reshape(numbers.shape) for a, b, numbers in zip(sizes[:-1], sizes[1:], seen, strict=True)]
     for a, b in _slices(first, 256):
         table = np.full((b - a, count + 1), -1, dtype=np.int32)
         for k in range(a, b):
@@ -517,7 +531,7 @@ def _starts(
         for i, at, base in _stretch(first, a, b, chunk):
             rows = row[at]
             out[i][rows] = table[base[:, None], seen[i][rows]]
-    return out
+    return flat
 
 
 def _rest(i: int, rows: Ints, sets: Ints, c: Chunk, position: Ints, front_of: Ints, rows_in: _RowsInFronts) -> Rest:

@@ -1,17 +1,15 @@
-"""Products of the design matrix with a vector: compiled loops for large systems, and their NumPy twins.
-
-numba is imported on first use and only here.
-"""
+"""Products of the design matrix with a vector: compiled loops for large systems, and their NumPy twins."""
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from baarda.compiling import compile_loops
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -95,17 +93,8 @@ class VectorLoops:
 @cache
 def compiled() -> VectorLoops | None:
     """Return the compiled loops, None without numba."""
-    try:
-        numba: Any = importlib.import_module("numba")
-    except ImportError:
-        return None
-    for cached in (True, False):  # no place to write the cache
-        try:
-            jit = numba.njit(nogil=True, cache=cached, error_model="numpy")
-            return VectorLoops(jit(_times), jit(_gathered), jit(_times_many), jit(_gathered_many))
-        except RuntimeError:
-            continue
-    return None
+    loops = compile_loops((_times, _gathered, _times_many, _gathered_many))
+    return None if loops is None else VectorLoops(*loops)
 
 
 def _times_many_twin(jacobian: Floats, nodes: Ints, table: Ints, x: Floats, first: Ints, out: Floats) -> None:

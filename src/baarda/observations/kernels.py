@@ -1,12 +1,11 @@
 """Image points, compiled: collinearity equations and the chains of the usual cameras, row by row.
 
 The steps of a camera model are numbered here; a model with a step that has no number is evaluated by its NumPy functions, whose oracle
-and twin this is. numba is imported on first use and only here.
+and twin this is.
 """
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baarda.cameras import Optics
+from baarda.compiling import compile_loops
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -73,111 +73,121 @@ class Program:
         return Program(np.array(steps, dtype=np.intp), np.array(places, dtype=np.intp).reshape(-1, 8), measured)
 
 
-def _chain(steps: Ints, places: Ints, begin: int, end: int, xy: Floats, p: Floats, partials: bool, d: Floats, dp: Floats, k: int) -> None:
-    """Lead xy (2,) through steps begin ... end; accumulate partials to xy in d (2, 2) and to the parameters in dp (2, k)."""
-    d[0, 0] = d[1, 1] = 1.0
-    d[0, 1] = d[1, 0] = 0.0
+def _chain(
+    steps: Ints, places: Ints, begin: int, end: int, x: float, y: float, parameters: Floats, camera: int, partials: bool, dp: Floats
+) -> tuple[float, float, float, float, float, float]:
+    """Lead a point through steps begin ... end of a camera (a row of the table of parameters).
+
+    Returned are the new point and the partials (d00 d01; d10 d11) to the old one; those to the parameters are accumulated in dp (2, k).
+    """
+    d00, d01, d10, d11 = 1.0, 0.0, 0.0, 1.0
     if partials:
-        for j in range(k):
+        for j in range(parameters.shape[1]):
             dp[0, j] = dp[1, j] = 0.0
+    used = False  # whether dp holds anything yet
     for s in range(begin, end):
-        step, at = steps[s], places[s]
-        x, y = xy[0], xy[1]
+        step = steps[s]
         a, b, c, e = 1.0, 0.0, 0.0, 1.0  # partials of the step: (a b; c e)
+        x0, y0 = x, y
+        r2 = xx = yy = xy2 = ratio = lower = 0.0
         if step == FLIP:
-            xy[1] = -y
+            y = -y0
             e = -1.0
         elif step == DISTANCE:
-            a = e = p[at[0]]
-            xy[0], xy[1] = a * x, a * y
+            a = e = parameters[camera, places[s, 0]]
+            x, y = a * x0, a * y0
         elif step == DISTANCES:
-            a, e = p[at[0]], p[at[1]]
-            xy[0], xy[1] = a * x, e * y
+            a, e = parameters[camera, places[s, 0]], parameters[camera, places[s, 1]]
+            x, y = a * x0, e * y0
         elif step == TO_CENTRE:
-            xy[0], xy[1] = x - p[at[0]], y - p[at[1]]
+            x, y = x0 - parameters[camera, places[s, 0]], y0 - parameters[camera, places[s, 1]]
         elif step == FROM_CENTRE:
-            xy[0], xy[1] = x + p[at[0]], y + p[at[1]]
+            x, y = x0 + parameters[camera, places[s, 0]], y0 + parameters[camera, places[s, 1]]
         elif step == LENS:
-            k1, k2, k3, p1, p2 = p[at[0]], p[at[1]], p[at[2]], p[at[3]], p[at[4]]
-            xx, yy, xy2 = x * x, y * y, 2.0 * x * y
+            k1, k2, k3 = parameters[camera, places[s, 0]], parameters[camera, places[s, 1]], parameters[camera, places[s, 2]]
+            p1, p2 = parameters[camera, places[s, 3]], parameters[camera, places[s, 4]]
+            xx, yy, xy2 = x0 * x0, y0 * y0, 2.0 * x0 * y0
             r2 = xx + yy
             radial = r2 * (k1 + r2 * (k2 + r2 * k3))
             slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
-            xy[0] = x + x * radial + p1 * (r2 + 2.0 * xx) + p2 * xy2
-            xy[1] = y + y * radial + p1 * xy2 + p2 * (r2 + 2.0 * yy)
-            a = 1.0 + radial + xx * slope + 6.0 * p1 * x + 2.0 * p2 * y
-            e = 1.0 + radial + yy * slope + 2.0 * p1 * x + 6.0 * p2 * y
-            b = c = x * y * slope + 2.0 * (p1 * y + p2 * x)
+            x = x0 + x0 * radial + p1 * (r2 + 2.0 * xx) + p2 * xy2
+            y = y0 + y0 * radial + p1 * xy2 + p2 * (r2 + 2.0 * yy)
+            a = 1.0 + radial + xx * slope + 6.0 * p1 * x0 + 2.0 * p2 * y0
+            e = 1.0 + radial + yy * slope + 2.0 * p1 * x0 + 6.0 * p2 * y0
+            b = c = x0 * y0 * slope + 2.0 * (p1 * y0 + p2 * x0)
         elif step == AFFINITY:
-            b1, b2 = p[at[0]], p[at[1]]
-            xy[0] = x + b1 * x + b2 * y
+            b1, b2 = parameters[camera, places[s, 0]], parameters[camera, places[s, 1]]
+            x = x0 + b1 * x0 + b2 * y0
             a, b = 1.0 + b1, b2
         else:
-            k1 = p[at[0]] if at[0] >= 0 else 0.0
-            k2 = p[at[1]] if at[1] >= 0 else 0.0
-            k3 = p[at[2]] if at[2] >= 0 else 0.0
-            k4 = p[at[3]] if at[3] >= 0 else 0.0
-            k5 = p[at[4]] if at[4] >= 0 else 0.0
-            k6 = p[at[5]] if at[5] >= 0 else 0.0
-            p1 = p[at[6]] if at[6] >= 0 else 0.0
-            p2 = p[at[7]] if at[7] >= 0 else 0.0
-            xx, yy, xy2 = x * x, y * y, 2.0 * x * y
+            k1 = parameters[camera, places[s, 0]] if places[s, 0] >= 0 else 0.0
+            k2 = parameters[camera, places[s, 1]] if places[s, 1] >= 0 else 0.0
+            k3 = parameters[camera, places[s, 2]] if places[s, 2] >= 0 else 0.0
+            k4 = parameters[camera, places[s, 3]] if places[s, 3] >= 0 else 0.0
+            k5 = parameters[camera, places[s, 4]] if places[s, 4] >= 0 else 0.0
+            k6 = parameters[camera, places[s, 5]] if places[s, 5] >= 0 else 0.0
+            p1 = parameters[camera, places[s, 6]] if places[s, 6] >= 0 else 0.0
+            p2 = parameters[camera, places[s, 7]] if places[s, 7] >= 0 else 0.0
+            xx, yy, xy2 = x0 * x0, y0 * y0, 2.0 * x0 * y0
             r2 = xx + yy
             lower = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
             ratio = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / lower
             slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3) - ratio * (k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6))) / lower
-            xy[0] = x * ratio + p1 * xy2 + p2 * (r2 + 2.0 * xx)
-            xy[1] = y * ratio + p1 * (r2 + 2.0 * yy) + p2 * xy2
-            a = ratio + xx * slope + 2.0 * p1 * y + 6.0 * p2 * x
-            e = ratio + yy * slope + 6.0 * p1 * y + 2.0 * p2 * x
-            b = c = x * y * slope + 2.0 * (p1 * x + p2 * y)
-        d[0, 0], d[1, 0] = a * d[0, 0] + b * d[1, 0], c * d[0, 0] + e * d[1, 0]
-        d[0, 1], d[1, 1] = a * d[0, 1] + b * d[1, 1], c * d[0, 1] + e * d[1, 1]
+            x = x0 * ratio + p1 * xy2 + p2 * (r2 + 2.0 * xx)
+            y = y0 * ratio + p1 * (r2 + 2.0 * yy) + p2 * xy2
+            a = ratio + xx * slope + 2.0 * p1 * y0 + 6.0 * p2 * x0
+            e = ratio + yy * slope + 6.0 * p1 * y0 + 2.0 * p2 * x0
+            b = c = x0 * y0 * slope + 2.0 * (p1 * x0 + p2 * y0)
+        d00, d10 = a * d00 + b * d10, c * d00 + e * d10
+        d01, d11 = a * d01 + b * d11, c * d01 + e * d11
         if not partials:
             continue
-        for j in range(k):
-            dp[0, j], dp[1, j] = a * dp[0, j] + b * dp[1, j], c * dp[0, j] + e * dp[1, j]
+        if used and step != TO_CENTRE and step != FROM_CENTRE:
+            for j in range(parameters.shape[1]):
+                dp[0, j], dp[1, j] = a * dp[0, j] + b * dp[1, j], c * dp[0, j] + e * dp[1, j]
+        used = used or step != FLIP
         if step == DISTANCE:
-            dp[0, at[0]] += x
-            dp[1, at[0]] += y
+            dp[0, places[s, 0]] += x0
+            dp[1, places[s, 0]] += y0
         elif step == DISTANCES:
-            dp[0, at[0]] += x
-            dp[1, at[1]] += y
+            dp[0, places[s, 0]] += x0
+            dp[1, places[s, 1]] += y0
         elif step == TO_CENTRE:
-            dp[0, at[0]] -= 1.0
-            dp[1, at[1]] -= 1.0
+            dp[0, places[s, 0]] -= 1.0
+            dp[1, places[s, 1]] -= 1.0
         elif step == FROM_CENTRE:
-            dp[0, at[0]] += 1.0
-            dp[1, at[1]] += 1.0
+            dp[0, places[s, 0]] += 1.0
+            dp[1, places[s, 1]] += 1.0
         elif step == LENS:
             power = r2
             for j in range(3):
-                dp[0, at[j]] += x * power
-                dp[1, at[j]] += y * power
+                dp[0, places[s, j]] += x0 * power
+                dp[1, places[s, j]] += y0 * power
                 power *= r2
-            dp[0, at[3]] += r2 + 2.0 * xx
-            dp[1, at[3]] += xy2
-            dp[0, at[4]] += xy2
-            dp[1, at[4]] += r2 + 2.0 * yy
+            dp[0, places[s, 3]] += r2 + 2.0 * xx
+            dp[1, places[s, 3]] += xy2
+            dp[0, places[s, 4]] += xy2
+            dp[1, places[s, 4]] += r2 + 2.0 * yy
         elif step == AFFINITY:
-            dp[0, at[0]] += x
-            dp[0, at[1]] += y
+            dp[0, places[s, 0]] += x0
+            dp[0, places[s, 1]] += y0
         elif step == OPENCV:
             power = r2 / lower
             for j in range(3):
-                if at[j] >= 0:
-                    dp[0, at[j]] += x * power
-                    dp[1, at[j]] += y * power
-                if at[j + 3] >= 0:
-                    dp[0, at[j + 3]] -= x * power * ratio
-                    dp[1, at[j + 3]] -= y * power * ratio
+                if places[s, j] >= 0:
+                    dp[0, places[s, j]] += x0 * power
+                    dp[1, places[s, j]] += y0 * power
+                if places[s, j + 3] >= 0:
+                    dp[0, places[s, j + 3]] -= x0 * power * ratio
+                    dp[1, places[s, j + 3]] -= y0 * power * ratio
                 power *= r2
-            if at[6] >= 0:
-                dp[0, at[6]] += xy2
-                dp[1, at[6]] += r2 + 2.0 * yy
-            if at[7] >= 0:
-                dp[0, at[7]] += r2 + 2.0 * xx
-                dp[1, at[7]] += xy2
+            if places[s, 6] >= 0:
+                dp[0, places[s, 6]] += xy2
+                dp[1, places[s, 6]] += r2 + 2.0 * yy
+            if places[s, 7] >= 0:
+                dp[0, places[s, 7]] += r2 + 2.0 * xx
+                dp[1, places[s, 7]] += xy2
+    return x, y, d00, d01, d10, d11
 
 
 def _evaluate(
@@ -192,45 +202,45 @@ def _evaluate(
     """
     k = parameters.shape[1]
     own = np.empty(6)
-    d, dm = np.empty((2, 2)), np.empty((2, 2))
     dp, dmp = np.zeros((2, k)), np.zeros((2, k))
-    target, xy = np.empty(2), np.empty(2)
-    h = np.empty((2, 3))
+    size_x, size_y, origin_x, origin_y = pixel_size[0], pixel_size[1], origin[0], origin[1]
     for i in range(len(pixels)):
-        p = parameters[camera[i]]
-        m = rotation[image[i]]
-        x = points[point[i], 0] - position[image[i], 0]
-        y = points[point[i], 1] - position[image[i], 1]
-        z = points[point[i], 2] - position[image[i], 2]
-        u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z
-        v = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z
-        w = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
+        cam, im, pt = camera[i], image[i], point[i]
+        m00, m01, m02 = rotation[im, 0, 0], rotation[im, 0, 1], rotation[im, 0, 2]
+        m10, m11, m12 = rotation[im, 1, 0], rotation[im, 1, 1], rotation[im, 1, 2]
+        m20, m21, m22 = rotation[im, 2, 0], rotation[im, 2, 1], rotation[im, 2, 2]
+        x, y, z = points[pt, 0] - position[im, 0], points[pt, 1] - position[im, 1], points[pt, 2] - position[im, 2]
+        u = m00 * x + m01 * y + m02 * z
+        v = m10 * x + m11 * y + m12 * z
+        w = m20 * x + m21 * y + m22 * z
         xn, yn = -u / w, -v / w
-        target[0], target[1] = xn, yn
-        _chain(steps, places, measured, len(steps), target, p, partials, d, dp, k)
+        tx, ty, d00, d01, d10, d11 = _chain(steps, places, measured, len(steps), xn, yn, parameters, cam, partials, dp)
         # the measured chain at the measured point, or its inverse
         px, py = pixels[i, 0], pixels[i, 1]
         if measured == 0:
-            misclosure[i, 0] = px - (target[0] / pixel_size[0] + origin[0])
-            misclosure[i, 1] = py - (target[1] / pixel_size[1] + origin[1])
-            a, e = 1.0 / pixel_size[0], 1.0 / pixel_size[1]
+            misclosure[i, 0] = (px - (tx / size_x + origin_x)) * weights[i, 0]
+            misclosure[i, 1] = (py - (ty / size_y + origin_y)) * weights[i, 1]
+            a, e = 1.0 / size_x, 1.0 / size_y
             b = c = 0.0
         elif corrected:
-            xy[0], xy[1] = (px - origin[0]) * pixel_size[0], (py - origin[1]) * pixel_size[1]
-            _chain(steps, places, 0, measured, xy, p, partials, dm, dmp, k)
-            misclosure[i, 0] = (xy[0] - target[0]) * to_pixels[0]
-            misclosure[i, 1] = (xy[1] - target[1]) * to_pixels[1]
+            gx, gy, _, _, _, _ = _chain(
+                steps, places, 0, measured, (px - origin_x) * size_x, (py - origin_y) * size_y, parameters, cam, partials, dmp
+            )
+            misclosure[i, 0] = (gx - tx) * to_pixels[0] * weights[i, 0]
+            misclosure[i, 1] = (gy - ty) * to_pixels[1] * weights[i, 1]
             a, e = to_pixels[0], to_pixels[1]
             b = c = 0.0
         else:
             least, done = np.inf, False
             bx, by = px, py
+            q00, q01, q10, q11 = 1.0, 0.0, 0.0, 1.0
             for _ in range(50):
-                xy[0], xy[1] = (px - origin[0]) * pixel_size[0], (py - origin[1]) * pixel_size[1]
-                _chain(steps, places, 0, measured, xy, p, False, dm, dmp, k)
-                rx, ry = target[0] - xy[0], target[1] - xy[1]
+                gx, gy, q00, q01, q10, q11 = _chain(
+                    steps, places, 0, measured, (px - origin_x) * size_x, (py - origin_y) * size_y, parameters, cam, False, dmp
+                )
+                rx, ry = tx - gx, ty - gy
                 misfit = np.sqrt(rx * rx + ry * ry)
-                size = np.sqrt(target[0] ** 2 + target[1] ** 2) + np.sqrt(xy[0] ** 2 + xy[1] ** 2) + 1e-300
+                size = np.sqrt(tx * tx + ty * ty) + np.sqrt(gx * gx + gy * gy) + 1e-300
                 if not misfit < least:  # rounding is reached, or no descent is left
                     done = least <= 1e-13 * size
                     break
@@ -238,40 +248,35 @@ def _evaluate(
                 if misfit <= 4e-16 * size:
                     done = True
                     break
-                det = dm[0, 0] * dm[1, 1] - dm[0, 1] * dm[1, 0]
-                px += (dm[1, 1] * rx - dm[0, 1] * ry) / det / pixel_size[0]
-                py += (dm[0, 0] * ry - dm[1, 0] * rx) / det / pixel_size[1]
+                det = q00 * q11 - q01 * q10
+                px += (q11 * rx - q01 * ry) / det / size_x
+                py += (q00 * ry - q10 * rx) / det / size_y
             if not done:
                 return i
-            px, py = bx, by
-            misclosure[i, 0], misclosure[i, 1] = pixels[i, 0] - px, pixels[i, 1] - py
+            misclosure[i, 0], misclosure[i, 1] = (pixels[i, 0] - bx) * weights[i, 0], (pixels[i, 1] - by) * weights[i, 1]
             if partials:
-                xy[0], xy[1] = (px - origin[0]) * pixel_size[0], (py - origin[1]) * pixel_size[1]
-                _chain(steps, places, 0, measured, xy, p, True, dm, dmp, k)
-            det = dm[0, 0] * dm[1, 1] - dm[0, 1] * dm[1, 0]
-            a, b = dm[1, 1] / det / pixel_size[0], -dm[0, 1] / det / pixel_size[0]
-            c, e = -dm[1, 0] / det / pixel_size[1], dm[0, 0] / det / pixel_size[1]
-        misclosure[i, 0] *= weights[i, 0]
-        misclosure[i, 1] *= weights[i, 1]
+                _, _, q00, q01, q10, q11 = _chain(
+                    steps, places, 0, measured, (bx - origin_x) * size_x, (by - origin_y) * size_y, parameters, cam, True, dmp
+                )
+            det = q00 * q11 - q01 * q10
+            a, b = q11 / det / size_x, -q01 / det / size_x
+            c, e = -q10 / det / size_y, q00 / det / size_y
         if not partials:
             continue
+        wx, wy = weights[i, 0], weights[i, 1]
         for place in range(len(keep_camera)):
             j = keep_camera[place]
             t0, t1 = dp[0, j] - dmp[0, j], dp[1, j] - dmp[1, j]
-            d_camera[i, 0, place] = (a * t0 + b * t1) * weights[i, 0]
-            d_camera[i, 1, place] = (c * t0 + e * t1) * weights[i, 1]
+            d_camera[i, 0, place] = (a * t0 + b * t1) * wx
+            d_camera[i, 1, place] = (c * t0 + e * t1) * wy
         for r in range(2):
-            f0 = a * d[0, 0] + b * d[1, 0] if r == 0 else c * d[0, 0] + e * d[1, 0]
-            f1 = a * d[0, 1] + b * d[1, 1] if r == 0 else c * d[0, 1] + e * d[1, 1]
-            f0, f1 = f0 * weights[i, r], f1 * weights[i, r]
-            h[r, 0], h[r, 1], h[r, 2] = -f0 / w, -f1 / w, -(f0 * xn + f1 * yn) / w
-            for j in range(3):
-                value = h[r, 0] * m[0, j] + h[r, 1] * m[1, j] + h[r, 2] * m[2, j]
-                d_point[i, r, j] = value
-                own[j] = -value
-            own[3] = h[r, 2] * v - h[r, 1] * w
-            own[4] = h[r, 0] * w - h[r, 2] * u
-            own[5] = h[r, 1] * u - h[r, 0] * v
+            f0 = (a * d00 + b * d10) * wx if r == 0 else (c * d00 + e * d10) * wy
+            f1 = (a * d01 + b * d11) * wx if r == 0 else (c * d01 + e * d11) * wy
+            h0, h1, h2 = -f0 / w, -f1 / w, -(f0 * xn + f1 * yn) / w
+            p0, p1, p2 = h0 * m00 + h1 * m10 + h2 * m20, h0 * m01 + h1 * m11 + h2 * m21, h0 * m02 + h1 * m12 + h2 * m22
+            d_point[i, r, 0], d_point[i, r, 1], d_point[i, r, 2] = p0, p1, p2
+            own[0], own[1], own[2] = -p0, -p1, -p2
+            own[3], own[4], own[5] = h2 * v - h1 * w, h0 * w - h2 * u, h1 * u - h0 * v
             for place in range(len(keep_image)):
                 d_image[i, r, place] = own[keep_image[place]]
     return -1
@@ -280,16 +285,5 @@ def _evaluate(
 @cache
 def compiled() -> Any:
     """Return the compiled loop over image points, None without numba."""
-    try:
-        numba: Any = importlib.import_module("numba")
-    except ImportError:
-        return None
-    global _chain
-    original = _chain
-    for cached in (True, False):  # no place to write the cache
-        try:
-            _chain = numba.njit(nogil=True, cache=cached, error_model="numpy")(original)
-            return numba.njit(nogil=True, cache=cached, error_model="numpy")(_evaluate)
-        except RuntimeError:
-            continue
-    return None
+    loops = compile_loops((_evaluate,), (_chain,))
+    return None if loops is None else loops[0]

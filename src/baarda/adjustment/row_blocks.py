@@ -1,0 +1,118 @@
+"""The row blocks of the points that are eliminated, as plain arrays for the loops."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from baarda.adjustment.linear_system import Linearization
+from baarda.adjustment.structure import Structure
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+Small = NDArray[np.int32]
+
+HEAD = 5  # entries of a chunk's row in the table before those of its parts
+
+
+class Blocks(NamedTuple):
+    """The row blocks of the inner points as plain arrays.
+
+    Attributes
+    ----------
+    values : array
+        The partials of all chunks.
+    table : (chunks, 5 + 3 parts) int array
+        For each chunk the rows m of a block, the number of parts, where the partials of the point, the places of the blocks and their
+        scalar rows begin, and for each part where its partials begin, its width, and whether it is a node.
+    starts : int32 array
+        Where the columns of each part of each block begin in its cluster, -1 = not there.
+    first_block, chunk, row, first_point, first_column, cluster_rows, cluster_columns, sparse
+        Of the structure.
+    inverse : array
+        Inverse column scales of the columns of all clusters; 0 = held.
+    point_inverse : (P, 3) array
+    prior : (P, 3) array
+        A further row for each coordinate of a point: damping, or 1 where the coordinate is held.
+    hat : array
+        Where the diagonal blocks of A N^-1 A' of each chunk begin.
+    scalar : int array
+        First scalar row of each row block, chunk after chunk.
+    """
+
+    values: Floats
+    table: Ints
+    starts: Small
+    first_block: Ints
+    chunk: Small
+    row: Small
+    first_point: Ints
+    first_column: Ints
+    cluster_rows: Small
+    cluster_columns: Ints
+    sparse: NDArray[np.bool_]
+    inverse: Floats
+    point_inverse: Floats
+    prior: Floats
+    hat: Ints
+    scalar: Ints
+
+
+def blocks_of(lin: Linearization, structure: Structure, inverse: Floats, damping: float) -> Blocks:
+    """Gather the arrays of a linear system for the loops.
+
+    Parameters
+    ----------
+    lin : Linearization
+    structure : Structure
+    inverse : (u + 1,) array
+        Inverse column scales; 0 for held unknowns, and last for fixed parameters.
+    damping : float
+        Added to the diagonal of the scaled normal matrix.
+    """
+    parts = max((len(c.parts) for c in lin.chunks), default=0)
+    table = np.zeros((len(lin.chunks), HEAD + 3 * parts), dtype=np.intp)
+    place, rows, hats = 0, 0, [0]
+    for k, (c, own) in enumerate(zip(lin.chunks, structure.point_part, strict=True)):
+        n, m = c.misclosure.shape
+        table[k, :HEAD] = m, len(c.parts), c.parts[own].start if own >= 0 else -1, place, rows
+        for j, p in enumerate(c.parts):
+            table[k, HEAD + 3 * j : HEAD + 3 + 3 * j] = p.start, len(p.positions), j != own
+        place += n * len(c.parts)
+        rows += n
+        hats.append(hats[-1] + n * m * m)
+    point_inverse = inverse[structure.point_columns]
+    prior = np.where(point_inverse > 0.0, np.sqrt(damping), 1.0)
+    columns = structure.order[structure.cluster_columns]
+    scalar = lin.chunks[0].first if len(lin.chunks) == 1 else np.concatenate([np.zeros(0, dtype=np.intp), *(c.first for c in lin.chunks)])
+    return Blocks(
+        lin.values, table, structure.starts, structure.first_block, structure.block_chunk, structure.block_row, structure.first_point,
+        structure.first_column, structure.cluster_rows, structure.cluster_columns, structure.sparse, inverse[columns], point_inverse, prior,
+        np.array(hats, dtype=np.intp), np.ascontiguousarray(scalar),
+    )  # fmt: skip
+
+
+def sizes(structure: Structure, blocks: Blocks) -> Ints:
+    """Return the sizes of the loops' buffers.
+
+    They are: rows of a point, Y, the square of a cluster, touched parts of a point, parts of a block, columns of a block, rows of a
+    cluster, points of a cluster.
+    """
+    count = np.diff(structure.first_point)
+    width = np.diff(structure.first_column)
+    height = np.where(structure.sparse, 3, 3 * count)
+    table = blocks.table
+    rows, parts = (int(a.max(initial=1)) for a in (table[:, 0], table[:, 1]))
+    columns = int(table[:, HEAD + 1 :: 3].sum(axis=1).max(initial=1))
+    most = structure.most_rows * rows + 6
+    per_point = np.concatenate([[0], np.cumsum(np.diff(structure.first_block) * rows + 6)])
+    in_cluster = np.where(structure.sparse, most, np.diff(per_point[structure.first_point]))
+    return np.array(
+        [
+            most, int((width * height).max(initial=1)), int((width**2).max(initial=1)), structure.most_rows * parts + 1, parts, columns,
+            int(in_cluster.max(initial=1)), int(count.max(initial=1)),
+        ],
+        dtype=np.intp,
+    )  # fmt: skip
