@@ -310,6 +310,40 @@ def test_held_columns(name, loops, clusters):
     compare(s, BlockSolver.of(s.lin, s.pattern, s.held))
 
 
+@pytest.mark.parametrize("name", list(NETWORKS))
+def test_a_part_of_a_larger_network(name, loops, clusters):
+    """Some images, cameras and joined points are left as a border; with the border's solution and cofactors all comes out as before."""
+    s = system(NETWORKS[name]())
+    lin = s.lin
+    image, camera = lin.unknowns["image"].columns.reshape(-1, 6), lin.unknowns["camera"].columns
+    shared = np.concatenate([image[1], image[-1], camera])
+    pattern = analyse(lin, rank_of_points(s.points), s.points, shared[shared >= 0])
+    part = BlockSolver.of(lin, pattern, s.held)
+    columns, matrix = part.border
+    assert set(columns) == set(np.setdiff1d(shared, [-1, *s.held]))
+    inverse, _, x, cond = oracle(s)
+    kept = np.ix_(columns, columns)
+    size = np.sqrt(np.diag(matrix))
+    tolerance = max(1e-10, EPS * cond**2)
+    assert np.abs((matrix - np.linalg.inv(inverse[kept])) / np.outer(size, size)).max() <= tolerance
+    y = lin.misclosure
+    moved = np.sqrt(np.abs(np.diag(inverse)))
+    own = np.abs(np.linalg.solve(matrix, part.reduced(y)) - x[columns])
+    assert (own <= tolerance * moved[columns] * max(np.linalg.norm(y), 1.0)).all()
+    found, change = part.expanded(y, x[columns])
+    assert (np.abs(found - x) <= tolerance * np.maximum(moved, 1e-300) * max(np.linalg.norm(y), 1.0)).all()
+    assert np.abs(change - lin.times(found)).max() <= 1e-10 * max(np.linalg.norm(y), 1.0)
+    with pytest.raises(baarda.errors.UsageError, match="cofactors of its border"):
+        part.hat()
+    whole, part = BlockSolver.of(lin, s.pattern, s.held), part.given(inverse[kept])
+    for a, b in zip(part.hat(), whole.hat(), strict=True):
+        assert np.abs(a - b).max(initial=0.0) <= tolerance
+    for nodes in (lin.unknowns["point"].columns.reshape(-1, 3), image):
+        nodes = nodes[(nodes >= 0).any(axis=1)]
+        size = np.sqrt(np.einsum("nii->n", whole.blocks(nodes)))[:, None, None] ** 2
+        assert np.abs(part.blocks(nodes) - whole.blocks(nodes)).max() <= tolerance * size.max()
+
+
 def test_all_cameras_known(loops):
     """Without nodes there is nothing to reduce to: points alone."""
     network = made("ring", images=5, points=20)

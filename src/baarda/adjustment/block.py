@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, cast
 
@@ -24,7 +24,7 @@ from baarda.adjustment.linear_system import Linearization
 from baarda.adjustment.row_blocks import Blocks, blocks_of, sizes
 from baarda.adjustment.structure import Front, Structure
 from baarda.adjustment.workers import for_each, run_tree
-from baarda.errors import Singular
+from baarda.errors import Singular, UsageError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -46,7 +46,8 @@ class BlockSolver:
     triangles: Floats
     panels: tuple[Floats, ...]
     size: Ints
-    _cache: dict[str, Any] = field(default_factory=dict, repr=False)
+    border_matrix: Floats | None = None
+    border_inverse: Floats | None = None
 
     @staticmethod
     def of(lin: Linearization, structure: Structure, held: Ints, damping: float = 0.0) -> BlockSolver:
@@ -90,6 +91,9 @@ class BlockSolver:
             for child in front.children:
                 loops.extend(matrix, updates.pop(child), structure.fronts[child].into_parent)
             matrix[np.arange(p), np.arange(p)] += diagonal[front.begin : front.begin + p]
+            if not p:  # the border of a part of a larger network
+                updates[f], panels[f] = matrix, matrix[:, :0]
+                return
             before = matrix[:p, :p].copy()
             info = lapack.cholesky(matrix[:p, :p])
             if info or np.diagonal(matrix)[:p].min(initial=1.0) ** 2 < SMALLEST_PIVOT:
@@ -111,7 +115,12 @@ class BlockSolver:
             _refuse_points(lin, structure.point_columns[bad])
         if weak:
             _refuse_nodes(lin, structure, inverse, arrays, loops, size, diagonal, *min(weak, key=lambda w: (not w[2], w[0])))
-        return BlockSolver(lin, structure, inverse, arrays, loops, triangles, tuple(p for p in panels if p is not None), size)
+        border = None
+        if structure.border:
+            border = updates[len(structure.fronts) - 1]
+            border = np.tril(border) + np.tril(border, -1).T
+        done = tuple(p for p in panels if p is not None)
+        return BlockSolver(lin, structure, inverse, arrays, loops, triangles, done, size, border)
 
     def at(self, lin: Linearization | None) -> BlockSolver:
         """Return this factor for the system at a state nearby, as an approximate one; None only lets the old system go."""
@@ -145,41 +154,107 @@ class BlockSolver:
 
     def least_squares(self, y: Floats) -> tuple[Floats, Floats]:
         """Return x = N^-1 A'y for an (n,) vector in the place of the whitened observations, and A x."""
-        if not self.loops.compiled:
+        if not self.loops.compiled and not self.structure.border:
             x = self.solve(self.lin.transposed(y))
             return x, self.lin.times(x)
-        s, arrays = self.structure, self.blocks_
-        order = np.append(s.order, -1)  # for rows that end at a parameter that is fixed
+        return self._backward(y, self._up(self._down(self._forward(y))))
+
+    def _forward(self, y: Floats) -> Floats:
+        """Return the scaled right-hand sides (U, 1) of the reduced system for A'y."""
+        s = self.structure
+        if not self.loops.compiled:
+            columns = np.append(self.lin.transposed(y), 0.0) * self.inverse
+            z = self._points(columns[s.point_columns][:, :, None])
+            x = np.zeros((len(columns), 1))
+            x[s.point_columns] = z * self.inverse[s.point_columns][:, :, None]
+            x[-1] = 0.0
+            return columns[s.order, None] - self._scaled_transposed(self.lin.times(x[:-1], {"point"}), self._reduced_kinds)[s.order]
 
         def forward(task: tuple[int, Ints]) -> Floats:
             f, clusters = task
             out = np.zeros(len(s.fronts[f].columns) if f >= 0 else 0)
-            self.loops.forward(clusters, y, arrays, self.triangles, out)
+            self.loops.forward(clusters, y, self.blocks_, self.triangles, out)
             return out
 
-        reduced = np.zeros(len(order))
-        for (f, _), own in zip(s.tasks, for_each(s.tasks, forward, self.lin.workers), strict=True):
+        reduced = np.zeros(len(s.order) + 1)  # the last is for parameters that are fixed
+        for (f, _), part in zip(s.tasks, for_each(s.tasks, forward, self.lin.workers), strict=True):
             if f >= 0:
-                reduced[s.fronts[f].columns] += own
-        rest = [(self.lin.chunks[e.chunk], e) for e in s.rest]
-        at = [np.where(e.at >= 0, self._columns_of_fronts[e.front[:, None], e.at], len(order) - 1) for _, e in rest]
-        for (c, e), columns in zip(rest, at, strict=True):
-            h = _scaled(c, e.rows, self.inverse)
-            reduced += np.bincount(columns.ravel(), np.einsum("nmw,nm->nw", h, y[c.rows[e.rows]]).ravel(), len(order))
-        solution = np.append(self.solve_reduced(reduced[:-1, None])[:, 0], 0.0)
+                reduced[s.fronts[f].columns] += part
+        for c, e, columns in self._rest:
+            own = np.einsum("nmw,nm->nw", _scaled(c, e.rows, self.inverse), y[c.rows[e.rows]])
+            np.add.at(reduced, columns, own)
+        return reduced[:-1, None]
+
+    def _backward(self, y: Floats, reduced: Floats) -> tuple[Floats, Floats]:
+        """Return x and A x, from A'y and the scaled solution (U, 1) of the reduced system."""
+        s = self.structure
+        x = np.zeros(len(self.inverse))
+        x[s.order] = reduced[:, 0] * self.inverse[s.order]
+        x[-1] = 0.0
+        if not self.loops.compiled:
+            left = self.lin.transposed(y - self.lin.times(x[:-1], self._reduced_kinds), {"point"})
+            scaled = (np.append(left, 0.0) * self.inverse)[s.point_columns]
+            x[s.point_columns] = self._points(scaled[:, :, None])[:, :, 0] * self.inverse[s.point_columns]
+            x[-1] = 0.0
+            return x[:-1], self.lin.times(x[:-1])
+        solution = np.append(reduced[:, 0], 0.0)
         points, change = np.zeros((len(s.points), 3)), np.zeros(len(y))
 
         def backward(task: tuple[int, Ints]) -> None:
-            self.loops.backward(task[1], solution, y, arrays, self.triangles, points, change)
+            self.loops.backward(task[1], solution, y, self.blocks_, self.triangles, points, change)
 
         for _ in for_each(s.tasks, backward, self.lin.workers):
             pass
-        for (c, e), columns in zip(rest, at, strict=True):
+        for c, e, columns in self._rest:
             change[c.rows[e.rows]] = np.einsum("nmw,nw->nm", _scaled(c, e.rows, self.inverse), solution[columns])
-        x = np.zeros(len(self.inverse))
-        x[order[:-1]] = solution[:-1] * self.inverse[order[:-1]]
         x[s.point_columns] = points
         return x[:-1], change
+
+    @property
+    def _rest(self) -> list[tuple[Any, Any, Ints]]:
+        """Row blocks without inner point: their chunk, the entry, and their columns in the order of elimination, the last one = fixed."""
+        fixed = len(self.structure.order)
+        return [
+            (self.lin.chunks[e.chunk], e, np.where(e.at >= 0, self._columns_of_fronts[e.front[:, None], e.at], fixed))
+            for e in self.structure.rest
+        ]
+
+    # ---- a part of a larger network ----
+    @cached_property
+    def border(self) -> tuple[Ints, Floats]:
+        """The unknowns (b,) that are left for the larger network, and the normal equations (b, b) reduced to them."""
+        own, used = self._border
+        scale = self.inverse[own[used]]
+        matrix = np.zeros((0, 0)) if self.border_matrix is None else self.border_matrix[np.ix_(used, used)]
+        return own[used], matrix / np.outer(scale, scale)
+
+    @property
+    def _border(self) -> tuple[Ints, Ints]:
+        """The unknowns of the last front, and which of them are neither fixed nor held."""
+        own = self.structure.order[len(self.structure.order) - self.structure.border :]
+        return own, np.flatnonzero(self.inverse[own] > 0.0)
+
+    def reduced(self, y: Floats) -> Floats:
+        """Return A'y reduced to the border, (b,)."""
+        own, used = self._border
+        return np.asarray(self._down(self._forward(y))[len(self.structure.order) - len(own) :, 0][used] / self.inverse[own[used]])
+
+    def expanded(self, y: Floats, x: Floats) -> tuple[Floats, Floats]:
+        """Return all unknowns and A x, given those (b,) of the border."""
+        own, used = self._border
+        down = self._down(self._forward(y))
+        last = np.zeros(len(own))
+        last[used] = x / self.inverse[own[used]]
+        down[len(down) - len(own) :, 0] = last
+        return self._backward(y, self._up(down))
+
+    def given(self, inverse: Floats) -> BlockSolver:
+        """Return this solver with the cofactors (b, b) of its border in the larger network, for statistics."""
+        own, used = self._border
+        z = np.zeros((len(own), len(own)))
+        scale = self.inverse[own[used]]
+        z[np.ix_(used, used)] = inverse / np.outer(scale, scale)
+        return replace(self, border_inverse=z)
 
     @cached_property
     def _columns_of_fronts(self) -> Ints:
@@ -215,17 +290,26 @@ class BlockSolver:
 
     def solve_reduced(self, rhs: Floats) -> Floats:
         """Return S^-1 rhs for (U, k) right-hand sides of the scaled reduced system in the order of elimination."""
-        x = np.ascontiguousarray(rhs)
+        return self._up(self._down(np.ascontiguousarray(rhs)))
+
+    def _down(self, x: Floats) -> Floats:
+        """Eliminate front by front, in place; what is left for a border stands in its rows."""
         for front, panel in zip(self.structure.fronts, self.panels, strict=True):
             p = front.pivots
-            own = x[front.begin : front.begin + p]
-            lapack.solve_left(panel[:p], own)
-            x[front.columns[p:]] -= panel[p:] @ own
+            if p:
+                own = x[front.begin : front.begin + p]
+                lapack.solve_left(panel[:p], own)
+                x[front.columns[p:]] -= panel[p:] @ own
+        return x
+
+    def _up(self, x: Floats) -> Floats:
+        """Substitute backwards, in place."""
         for front, panel in zip(reversed(self.structure.fronts), reversed(self.panels), strict=True):
             p = front.pivots
-            own = x[front.begin : front.begin + p]
-            own -= panel[p:].T @ x[front.columns[p:]]
-            lapack.solve_left_transposed(panel[:p], own)
+            if p:
+                own = x[front.begin : front.begin + p]
+                own -= panel[p:].T @ x[front.columns[p:]]
+                lapack.solve_left_transposed(panel[:p], own)
         return x
 
     @cached_property
@@ -234,6 +318,8 @@ class BlockSolver:
         n = self.count
         if not n:
             return 1.0
+        if self.structure.border:
+            raise UsageError("a part of a larger network has no condition number of its own")
 
         def product(x: Floats) -> Floats:
             y = x.reshape(n, -1).copy()
@@ -280,6 +366,8 @@ class BlockSolver:
     @cached_property
     def _statistics(self) -> tuple[list[Floats], Floats, Callable[[Ints], Floats]]:
         structure, lin = self.structure, self.lin
+        if structure.border and self.border_inverse is None:
+            raise UsageError("a part of a larger network needs the cofactors of its border")
         hat = np.zeros(int(self.blocks_.hat[-1]))
         points = np.zeros((len(structure.points), 3, 3))
         own: list[Floats | None] = [None] * len(structure.fronts)
@@ -293,6 +381,9 @@ class BlockSolver:
         def invert(f: int) -> None:
             front, panel = structure.fronts[f], self.panels[f]
             n, p = len(front.columns), front.pivots
+            if not p and self.border_inverse is not None:
+                finish(f, self.border_inverse, n)
+                return
             z = np.empty((n, n))
             corner = panel[:p].copy()
             if p < n:
@@ -307,6 +398,11 @@ class BlockSolver:
             if p < n:
                 lapack.multiply_transposed(g, z[p:, :p], z[:p, :p], -1.0, 1.0)
                 z[:p, :p] = 0.5 * (z[:p, :p] + z[:p, :p].T)
+            finish(f, z, p)
+
+        def finish(f: int, z: Floats, p: int) -> None:
+            """Use the inverse of a front, its first p columns its own."""
+            front = structure.fronts[f]
             self.loops.statistics(front.clusters, z, self.blocks_, hat, points, self.size)
             for chunk, rows, at in rest.get(f, ()):
                 self._rest_hat(z, chunk, rows, at, hat)
@@ -416,7 +512,7 @@ def _refuse_nodes(
 ) -> None:  # fmt: skip
     """Name the unknowns of a null space: of the whole reduced matrix where it is small enough, else of the front that shows it."""
     n = len(structure.order)
-    if n > SEARCHED:
+    if n > SEARCHED or structure.border:
         front = structure.fronts[weakest]
         columns = structure.order[front.begin : front.begin + front.pivots]
         refuse_null_space(np.tril(pivots) + np.tril(pivots, -1).T, columns, lin, failed)

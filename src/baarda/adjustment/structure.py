@@ -9,7 +9,7 @@ factorisation (Duff & Reid 1983); a cluster belongs to the front where its first
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -102,6 +102,8 @@ class Structure:
     fronts : tuple of Front
         Children before parents.
     rest : tuple of Rest
+    border : int
+        Columns of the last front if that is not eliminated but left for a larger network, else 0.
     """
 
     order: Ints
@@ -119,6 +121,7 @@ class Structure:
     sparse: Bools
     fronts: tuple[Front, ...]
     rest: tuple[Rest, ...]
+    border: int = 0
 
     @cached_property
     def tasks(self) -> list[tuple[int, Ints]]:
@@ -212,7 +215,7 @@ def _spread(x: NDArray[np.int64]) -> NDArray[np.int64]:
     return x
 
 
-def analyse(lin: Linearization, rank: Ints, coordinates: Floats) -> Structure:
+def analyse(lin: Linearization, rank: Ints, coordinates: Floats, border: Ints | None = None) -> Structure:
     """Analyse the pattern of a linear system.
 
     Parameters
@@ -223,6 +226,8 @@ def analyse(lin: Linearization, rank: Ints, coordinates: Floats) -> Structure:
         Points of neighbouring rank should be seen by the same images.
     coordinates : (points, 3) array
         Approximate, by which images are placed for the dissection.
+    border : int array, optional
+        Unknowns that other parts of a larger network share: their nodes are not eliminated.
 
     Returns
     -------
@@ -243,7 +248,8 @@ def analyse(lin: Linearization, rank: Ints, coordinates: Floats) -> Structure:
     rest = [(i, np.flatnonzero(o < 0)) for i, o in enumerate(owner) if (o < 0).any()]
     cliques = [*members, *(m for i, rows in rest for m in _distinct(seen[i][rows]))]
     centres = _centres(coordinates[points], first_point)
-    parts = dissect(_graph(cliques, nodes.count), nodes.places(members, centres))
+    kept = nodes.holding(border)
+    parts = _dissected(_graph(cliques, nodes.count), nodes.places(members, centres), kept)
 
     elimination = np.concatenate([np.zeros(0, dtype=np.intp), *parts])
     position = np.empty(nodes.count, dtype=np.intp)
@@ -257,6 +263,8 @@ def analyse(lin: Linearization, rank: Ints, coordinates: Floats) -> Structure:
     home = np.array([front_of[m[0]] if len(m) else -1 for m in members], dtype=np.intp)
     front_nodes = _nodes_of_fronts(parts, cliques, position, front_of)
     fronts = _fronts(parts, front_nodes, home, nodes, begin, front_of)
+    if kept.any():
+        fronts = (*fronts[:-1], replace(fronts[-1], pivots=0))
     rows_in = _RowsInFronts(front_nodes, nodes)
     widths = [nodes.width[m] for m in members]
     first_column = np.concatenate([[0], np.cumsum([int(w.sum()) for w in widths])]).astype(np.intp)
@@ -276,7 +284,17 @@ def analyse(lin: Linearization, rank: Ints, coordinates: Floats) -> Structure:
         sparse=sparse,
         fronts=fronts,
         rest=tuple(_rest(i, rows, seen[i][rows], lin.chunks[i], position, front_of, rows_in) for i, rows in rest),
+        border=int(nodes.width[kept].sum()),
     )
+
+
+def _dissected(graph: Any, places: Floats | None, kept: Bools) -> list[Ints]:
+    """Dissect the nodes but those to keep, which come last."""
+    if not kept.any():
+        return dissect(graph, places)
+    free = np.flatnonzero(~kept)
+    parts = dissect(graph[free][:, free], None if places is None else places[free]) if len(free) else []
+    return [*(free[p] for p in parts), np.flatnonzero(kept)]
 
 
 def inner_points(lin: Linearization) -> Bools:
@@ -322,6 +340,13 @@ class _Nodes:
     @property
     def count(self) -> int:
         return len(self.width)
+
+    def holding(self, columns: Ints | None) -> Bools:
+        """Return which nodes hold any of some unknowns."""
+        at = np.isin(self.unknowns, [] if columns is None else columns)
+        out = np.zeros(self.count, dtype=bool)
+        out[np.repeat(np.arange(self.count), self.width)[at]] = True
+        return out
 
     def columns_of(self, node: int) -> Ints:
         return self.unknowns[self.offset[node] : self.offset[node + 1]]
