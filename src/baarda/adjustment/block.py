@@ -124,7 +124,7 @@ class BlockSolver:
 
     def at(self, lin: Linearization | None) -> BlockSolver:
         """Return this factor for the system at a state nearby, as an approximate one; None only lets the old system go."""
-        values = self.blocks_.values[:0] if lin is None else lin.values
+        values = np.zeros(0) if lin is None else lin.values  # no view: it would keep the old ones
         return replace(self, lin=cast(Linearization, lin), blocks_=self.blocks_._replace(values=values))
 
     @property
@@ -163,12 +163,12 @@ class BlockSolver:
         """Return the scaled right-hand sides (U, 1) of the reduced system for A'y."""
         s = self.structure
         if not self.loops.compiled:
-            columns = np.append(self.lin.transposed(y), 0.0) * self.inverse
-            z = self._points(columns[s.point_columns][:, :, None])
-            x = np.zeros((len(columns), 1))
+            scaled = np.append(self.lin.transposed(y), 0.0) * self.inverse
+            z = self._points(scaled[s.point_columns][:, :, None])
+            x = np.zeros((len(scaled), 1))
             x[s.point_columns] = z * self.inverse[s.point_columns][:, :, None]
             x[-1] = 0.0
-            return columns[s.order, None] - self._scaled_transposed(self.lin.times(x[:-1], {"point"}), self._reduced_kinds)[s.order]
+            return scaled[s.order, None] - self._scaled_transposed(self.lin.times(x[:-1], {"point"}), self._reduced_kinds)[s.order]
 
         def forward(task: tuple[int, Ints]) -> Floats:
             f, clusters = task
