@@ -408,19 +408,21 @@ def _clusters(first_block: Ints, chunk: Small, row: Small, seen: list[Ints], nod
     """Gather neighbouring points that see nearly the same nodes: first point of each cluster, its nodes, whether it is sparse."""
     count = len(first_block) - 1
     cuts = np.append(np.arange(0, count, BASE), count) if count else np.zeros(1, dtype=np.intp)
-    sets: list[Ints] = []
+    seen_by: list[frozenset[int]] = []
     for a, b in _slices(cuts, 256):
         mark = np.zeros((b - a, nodes.count), dtype=bool)
         for i, at, base in _stretch(first_block[cuts], a, b, chunk):
             for j in range(seen[i].shape[1]):
                 number = seen[i][row[at], j]
                 mark[base[number >= 0], number[number >= 0]] = True
-        sets += [np.flatnonzero(m) for m in mark]
+        base, number = np.nonzero(mark)
+        ends, numbers = np.searchsorted(base, np.arange(b - a + 1)).tolist(), number.tolist()
+        seen_by += [frozenset(numbers[i:j]) for i, j in zip(ends[:-1], ends[1:], strict=True)]
     touched = _touched(first_block, chunk, row, seen, nodes).astype(float) ** 2
     effort = np.concatenate([[0.0], np.cumsum(touched)])
     width_of = nodes.width.tolist()
-    ends, seen_by = cuts.tolist(), [frozenset(s.tolist()) for s in sets]
-    widths = [sum(width_of[i] for i in s) for s in seen_by]
+    ends = cuts.tolist()
+    widths = [sum([width_of[i] for i in s]) for s in seen_by]
     first, members, sparse = [0], [], []
     k = 0
     while k < len(seen_by):
@@ -428,7 +430,7 @@ def _clusters(first_block: Ints, chunk: Small, row: Small, seen: list[Ints], nod
         width = widest = widths[k]
         while end < len(seen_by) and ends[end + 1] - ends[k] <= MOST:
             more = union | seen_by[end]
-            size = width + sum(width_of[i] for i in seen_by[end] - union)
+            size = width + sum([width_of[i] for i in seen_by[end] - union])
             widest = max(widest, widths[end])
             if size > GROWTH * widest or size * (ends[end + 1] - ends[k]) > LARGEST:
                 break
