@@ -268,6 +268,13 @@ def compare(s, solver, damping=0.0):
             there = size > 0.0
             assert (np.abs(got - expected)[there] <= tolerance * size[there]).all(), group.kind
             assert (got[~there] == 0.0).all()
+    some = np.unique(np.linspace(0, len(inverse) - 1, 25).astype(int))
+    camera = s.lin.unknowns["camera"].columns
+    for a, b in ((some, np.append(some[:7], -1)), (camera, s.lin.unknowns["image"].columns[:12])):
+        expected = np.zeros((len(inverse) + 1, len(inverse) + 1))
+        expected[:-1, :-1] = inverse
+        size = np.sqrt(np.outer(np.diag(expected)[a], np.diag(expected)[b]))
+        assert (np.abs(solver.pairs(a, b) - expected[np.ix_(a, b)]) <= tolerance * size).all()
     got = solver.solve(s.rhs)
     assert (got[s.held] == 0.0).all()
     moved = np.sqrt(np.abs(np.diag(inverse)))

@@ -31,6 +31,7 @@ Ints = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
 SEARCHED = 4000  # columns up to which a null space is sought in the whole reduced matrix
+AT_ONCE = 16_000_000  # doubles in the right-hand sides that are solved together
 SMALLEST_PIVOT = 1e-15  # of a column scaled to length 1: what other unknowns leave of its square
 
 
@@ -361,6 +362,27 @@ class BlockSolver:
         out[inner] = np.where(free[:, :, None] & free[:, None, :], found, 0.0)
         outer = np.flatnonzero(where < 0)
         out[outer] = nodes(columns[outer])
+        return out
+
+    def pairs(self, a: Ints, b: Ints) -> Floats:
+        """Return the (len(a), len(b)) block of N^-1 for any columns; zero where a column is -1 or held."""
+        order = self.structure.order
+        place = np.full(len(self.inverse), -1)
+        place[order] = np.arange(len(order))
+        place[-1] = -1
+        reduced = bool((place[a] >= 0).all() and (place[b] >= 0).all())
+        size = len(order) if reduced else len(self.inverse) - 1
+        out = np.zeros((len(a), len(b)))
+        step = max(1, AT_ONCE // max(size, 1))
+        for k in range(0, len(b), step):
+            some = b[k : k + step]
+            unit = np.zeros((size + 1, len(some)))
+            if reduced:  # the points need not be known
+                unit[place[some], np.arange(len(some))] = self.inverse[some]
+                out[:, k : k + step] = self.solve_reduced(unit[:-1])[place[a]] * self.inverse[a][:, None]
+            else:
+                unit[some, np.arange(len(some))] = 1.0  # that of -1 is the last row
+                out[:, k : k + step] = np.append(self.solve(unit[:-1]), np.zeros((1, len(some))), axis=0)[a]
         return out
 
     @cached_property

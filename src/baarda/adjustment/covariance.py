@@ -34,6 +34,8 @@ class Cofactors:
         b = a if b is None else b
         if len(b) > len(a):
             return self.of(b, a).T
+        if self.datum.transfer is None:
+            return self.solver.pairs(a, b)
         out = np.zeros((len(a), len(b)))
         step = max(1, AT_ONCE // max(self.count, 1))
         for k in range(0, len(b), step):

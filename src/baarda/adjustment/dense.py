@@ -73,6 +73,10 @@ class DenseSolver:
         at = self.place[columns]
         return np.asarray(self._inverse[at[:, :, None], at[:, None, :]])
 
+    def pairs(self, a: Ints, b: Ints) -> Floats:
+        """Return the (len(a), len(b)) block of N^-1 for any columns; zero for columns below zero and held ones."""
+        return np.asarray(self._inverse[np.ix_(self.place[a], self.place[b])])
+
     @cached_property
     def place(self) -> Ints:
         """Row of each unknown in the factor; the last one, for -1 and held unknowns, is a row of zeros in the inverse."""

@@ -107,7 +107,9 @@ def iterate(
             del lin
             lin = linearize(network, state, unknowns, groups, workers)
         stalled = stalled + 1 if relative <= 1e-7 and relative >= 0.8 * last else 0
-        settled = relative <= settings.tolerance or stalled == 2 or (relative < 1e-9 and relative >= 0.5 * last)  # only rounding is left
+        rate = relative / last if damping == 0.0 and np.isfinite(last) and relative < 0.1 * last else 1.0
+        left = relative * rate  # the next step, by the rate of the last two
+        settled = left <= settings.tolerance or stalled == 2 or (relative < 1e-9 and relative >= 0.5 * last)  # only rounding is left
         if settled and (damping == 0.0 or _full_step(lin, tied, factor) <= 1e-6):
             return state, lin, history, True
         damping *= max(0.5 if curved else 0.2, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)

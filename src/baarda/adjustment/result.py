@@ -322,10 +322,8 @@ class Adjustment:
         at = group.columns.reshape(-1, 6)
         images = at[at >= 0]
         variances = np.einsum("nii->ni", self.cofactors.blocks(at))[at >= 0]
-        unit = np.zeros((self.numbering.count, len(columns)))
-        unit[columns, np.arange(len(columns))] = 1.0
         others = np.concatenate([columns, images])
-        q = self.cofactors.solve(unit)[others]
+        q = self.cofactors.of(others, columns)
         with np.errstate(divide="ignore", invalid="ignore"):
             r = q / np.sqrt(np.outer(np.concatenate([np.diag(e.cofactors), variances]), np.diag(e.cofactors)))
         r[: len(columns)] = np.tril(r[: len(columns)], -1)

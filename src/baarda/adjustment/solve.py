@@ -48,7 +48,8 @@ class Settings:
     iterations : int
         Limit of the number of steps, rejected ones included.
     tolerance : float
-        Converged when the step changes the adjusted observations by less than this part of the residuals (both weighted norms).
+        Converged when what is left changes the adjusted observations by less than this part of the residuals (both weighted norms): the
+        last step, or the one that would follow it at the rate of the last two.
     camera : str, tuple of str or None
         Interior and additional parameters to estimate, or a preset: see `baarda.adjustment.camera_choice.with_cameras`. None leaves the
         states of the source, ``()`` fixes all.

@@ -32,3 +32,6 @@ class Solver(Protocol):
 
     def blocks(self, columns: Ints) -> Floats:
         """Return the (N, w, w) blocks of N^-1 for (N, w) columns; -1 = fixed, zero."""
+
+    def pairs(self, a: Ints, b: Ints) -> Floats:
+        """Return the (len(a), len(b)) block of N^-1 for any columns; -1 = fixed, zero."""

@@ -8,6 +8,7 @@ factorisation (Duff & Reid 1983); a cluster belongs to the front where its first
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -417,7 +418,7 @@ def _clusters(first_block: Ints, chunk: Small, row: Small, seen: list[Ints], nod
                 mark[base[number >= 0], number[number >= 0]] = True
         base, number = np.nonzero(mark)
         ends, numbers = np.searchsorted(base, np.arange(b - a + 1)).tolist(), number.tolist()
-        seen_by += [frozenset(numbers[i:j]) for i, j in zip(ends[:-1], ends[1:], strict=True)]
+        seen_by += [frozenset(numbers[i:j]) for i, j in itertools.pairwise(ends)]
     touched = _touched(first_block, chunk, row, seen, nodes).astype(float) ** 2
     effort = np.concatenate([[0.0], np.cumsum(touched)])
     width_of = nodes.width.tolist()
