@@ -32,7 +32,8 @@ from threadpoolctl import threadpool_limits
 import baarda
 from baarda.adjustment.block import BlockSolver
 from baarda.adjustment.linearize import Arrangement, linearize
-from baarda.adjustment.structure import analyse, rank_of_points
+from baarda.adjustment.point_order import rank_of_points
+from baarda.adjustment.structure import analyse
 from baarda.cameras import FIXED
 from baarda.hypotheses.outliers import mdb, standardised, tau
 from baarda.network import CONTROL, Network, State

@@ -13,14 +13,16 @@ from threadpoolctl import threadpool_limits
 import baarda
 from baarda import cameras
 from baarda.adjustment import block as block_module
-from baarda.adjustment import kernels, structure, vector_loops, workers
+from baarda.adjustment import clusters as clusters_
+from baarda.adjustment import kernels, vector_loops, workers
 from baarda.adjustment.block import BlockSolver
 from baarda.adjustment.datum import find_defect
 from baarda.adjustment.dense import DenseSolver
 from baarda.adjustment.dissection import dissect
 from baarda.adjustment.linearize import Arrangement, linearize
+from baarda.adjustment.point_order import rank_of_points
 from baarda.adjustment.solve import Settings, active_groups, choose_datum, prepare
-from baarda.adjustment.structure import analyse, inner_points, rank_of_points
+from baarda.adjustment.structure import analyse, inner_points
 from baarda.cameras import FIXED, FREE, OBSERVED
 from baarda.errors import Singular, UsageError
 from baarda.network import CONTROL, Images, Network, Points, State, unknowns_of
@@ -53,7 +55,7 @@ def loops(request, monkeypatch):
 @pytest.fixture(params=["dense clusters", "sparse clusters"])
 def clusters(request, monkeypatch):
     """Clusters whose points are treated together, or one by one."""
-    monkeypatch.setattr(structure, "SPARSE", 1e-9 if request.param == "sparse clusters" else 1e9)
+    monkeypatch.setattr(clusters_, "SPARSE", 1e-9 if request.param == "sparse clusters" else 1e9)
     return request.param
 
 
@@ -505,7 +507,7 @@ def test_more_fronts_than_threads_change_no_bit(monkeypatch):
     """A tree of many fronts, so that the order in which they finish varies."""
     monkeypatch.setattr(kernels, "COMPILE_FROM", 10**9)
     for name, value in (("BASE", 1), ("MOST", 2)):
-        monkeypatch.setattr(structure, name, value)
+        monkeypatch.setattr(clusters_, name, value)
     monkeypatch.setattr("baarda.adjustment.structure.dissect", lambda graph, places: dissect(graph, None, 3))
     s = system(chain(80, 450))
     assert len(s.pattern.fronts) > 6

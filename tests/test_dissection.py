@@ -8,7 +8,7 @@ from scipy.sparse import coo_array, csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
 
 from baarda.adjustment.dissection import _vertex_cover, dissect
-from baarda.adjustment.structure import rank_of_points
+from baarda.adjustment.point_order import rank_of_points
 
 
 def graph_of(n, edges):

@@ -6,8 +6,6 @@ share a point, which is all that the cofactors of points and the redundancy numb
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,7 +19,8 @@ from baarda.adjustment import lapack
 from baarda.adjustment.dense import refuse_null_space
 from baarda.adjustment.kernels import Kernels, kernels
 from baarda.adjustment.linear_system import Linearization
-from baarda.adjustment.row_blocks import Blocks, blocks_of, sizes
+from baarda.adjustment.row_blocks import Blocks, blocks_of, scaled_rows, sizes
+from baarda.adjustment.selected_inverse import NodeBlocks, selected_inverse
 from baarda.adjustment.structure import Front, Structure
 from baarda.adjustment.workers import for_each, run_tree
 from baarda.errors import Singular, UsageError
@@ -108,7 +107,7 @@ class BlockSolver:
                 updates[f] = update.copy()
             panels[f] = np.ascontiguousarray(matrix[:, :p])
 
-        orphans = _orphans(structure)
+        orphans = structure.orphans
         loops.accumulate(orphans, np.zeros((0, 0)), arrays, triangles, bad, size)
         with suppress(Singular):  # the reason is found below
             run_tree([len(f.children) for f in structure.fronts], [_after(f) for f in structure.fronts], factor, lin.workers)
@@ -182,7 +181,7 @@ class BlockSolver:
             if f >= 0:
                 reduced[s.fronts[f].columns] += part
         for c, e, columns in self._rest:
-            own = np.einsum("nmw,nm->nw", _scaled(c, e.rows, self.inverse), y[c.rows[e.rows]])
+            own = np.einsum("nmw,nm->nw", scaled_rows(c, e.rows, self.inverse), y[c.rows[e.rows]])
             np.add.at(reduced, columns, own)
         return reduced[:-1, None]
 
@@ -207,7 +206,7 @@ class BlockSolver:
         for _ in for_each(s.tasks, backward, self.lin.workers):
             pass
         for c, e, columns in self._rest:
-            change[c.rows[e.rows]] = np.einsum("nmw,nw->nm", _scaled(c, e.rows, self.inverse), solution[columns])
+            change[c.rows[e.rows]] = np.einsum("nmw,nw->nm", scaled_rows(c, e.rows, self.inverse), solution[columns])
         x[s.point_columns] = points
         return x[:-1], change
 
@@ -386,128 +385,20 @@ class BlockSolver:
         return out
 
     @cached_property
-    def _statistics(self) -> tuple[list[Floats], Floats, Callable[[Ints], Floats]]:
-        structure, lin = self.structure, self.lin
-        if structure.border and self.border_inverse is None:
+    def _statistics(self) -> tuple[list[Floats], Floats, NodeBlocks]:
+        if self.structure.border and self.border_inverse is None:
             raise UsageError("a part of a larger network needs the cofactors of its border")
-        hat = np.zeros(int(self.blocks_.hat[-1]))
-        points = np.zeros((len(structure.points), 3, 3))
-        own: list[Floats | None] = [None] * len(structure.fronts)
-        inverses: dict[int, Floats] = {}
-        left, lock = [len(f.children) for f in structure.fronts], threading.Lock()
-        rest: dict[int, list[tuple[int, Ints, Ints]]] = {}
-        for entry in structure.rest:
-            for f in np.unique(entry.front):
-                rest.setdefault(int(f), []).append((entry.chunk, entry.rows[entry.front == f], entry.at[entry.front == f]))
-
-        def invert(f: int) -> None:
-            front, panel = structure.fronts[f], self.panels[f]
-            n, p = len(front.columns), front.pivots
-            if not p and self.border_inverse is not None:
-                finish(f, self.border_inverse, n)
-                return
-            z = np.empty((n, n))
-            corner = panel[:p].copy()
-            if p < n:
-                outer = z[p:, p:]
-                self.loops.gather(inverses[front.parent], front.into_parent, outer)
-                g = panel[p:].copy()
-                lapack.solve_right(corner, g)
-                lapack.multiply(outer, g, z[p:, :p], -1.0)
-                z[:p, p:] = z[p:, :p].T
-            lapack.invert_from_cholesky(corner)
-            z[:p, :p] = np.tril(corner) + np.tril(corner, -1).T
-            if p < n:
-                lapack.multiply_transposed(g, z[p:, :p], z[:p, :p], -1.0, 1.0)
-                z[:p, :p] = 0.5 * (z[:p, :p] + z[:p, :p].T)
-            finish(f, z, p)
-
-        def finish(f: int, z: Floats, p: int) -> None:
-            """Use the inverse of a front, its first p columns its own."""
-            front = structure.fronts[f]
-            self.loops.statistics(front.clusters, z, self.blocks_, hat, points, self.size)
-            for chunk, rows, at in rest.get(f, ()):
-                self._rest_hat(z, chunk, rows, at, hat)
-            own[f] = z[:p, :p].copy()
-            if front.children:
-                inverses[f] = z
-            if front.parent >= 0:
-                with lock:
-                    left[front.parent] -= 1
-                    if left[front.parent] == 0:
-                        del inverses[front.parent]
-
-        fronts = structure.fronts
-        before = [int(f.parent >= 0) for f in reversed(fronts)]  # from the root to the leaves
-        run_tree(before, _children_backwards(fronts), lambda i: invert(len(fronts) - 1 - i), lin.workers)
-        self.loops.statistics(_orphans(structure), np.zeros((0, 0)), self.blocks_, hat, points, self.size)
-        for f, entries in rest.items():
-            if f < 0:
-                for chunk, rows, at in entries:
-                    self._rest_hat(np.zeros((0, 0)), chunk, rows, at, hat)
-        out = []
-        for k, c in enumerate(lin.chunks):
-            m = c.misclosure.shape[1]
-            out.append(hat[self.blocks_.hat[k] : self.blocks_.hat[k + 1]].reshape(-1, m, m))
-        return out, points, _NodeBlocks(structure, [z for z in own if z is not None], self.inverse)
-
-    def _rest_hat(self, z: Floats, chunk: int, rows: Ints, at: Ints, hat: Floats) -> None:
-        """Store the diagonal blocks of rows without inner point."""
-        c = self.lin.chunks[chunk]
-        h = _scaled(c, rows, self.inverse)
-        padded = np.zeros((len(z) + 1, len(z) + 1))
-        padded[:-1, :-1] = z
-        m = c.misclosure.shape[1]
-        values = h @ padded[at[:, :, None], at[:, None, :]] @ h.transpose(0, 2, 1)
-        hat[self.blocks_.hat[chunk] + rows[:, None] * (m * m) + np.arange(m * m)] = values.reshape(len(rows), -1)
-
-
-class _NodeBlocks:
-    """Blocks of the inverse whose columns are eliminated in one front."""
-
-    def __init__(self, structure: Structure, own: list[Floats], inverse: Floats) -> None:
-        self.own, self.fronts, self.inverse = own, structure.fronts, inverse
-        self.place = np.full(len(inverse), -1)
-        self.place[structure.order] = np.arange(len(structure.order))
-        self.place[-1] = -1
-        begins = np.array([f.begin for f in structure.fronts], dtype=np.intp)
-        self.begins = begins
-
-    def __call__(self, columns: Ints) -> Floats:
-        """Return (N, w, w) blocks; zero where a column is -1 or held."""
-        at = self.place[columns]
-        out = np.zeros((*columns.shape, columns.shape[1]))
-        front = np.searchsorted(self.begins, at.max(axis=1), side="right") - 1
-        for f in np.unique(front[at.max(axis=1) >= 0]):
-            rows = np.flatnonzero((front == f) & (at.max(axis=1) >= 0))
-            local = np.where(at[rows] >= 0, at[rows] - self.fronts[f].begin, 0)
-            weight = np.where(at[rows] >= 0, self.inverse[columns[rows]], 0.0)
-            out[rows] = self.own[f][local[:, :, None], local[:, None, :]] * weight[:, :, None] * weight[:, None, :]
-        return out
-
-
-def _orphans(structure: Structure) -> Ints:
-    """Return the clusters that touch no node."""
-    return np.flatnonzero(np.diff(structure.first_column) == 0)
+        return selected_inverse(self)
 
 
 def _after(front: Front) -> list[int]:
     return [front.parent] if front.parent >= 0 else []
 
 
-def _children_backwards(fronts: tuple[Front, ...]) -> list[list[int]]:
-    return [[len(fronts) - 1 - c for c in f.children] for f in reversed(fronts)]
-
-
-def _scaled(c: Any, rows: Ints, inverse: Floats) -> Floats:
-    """Return the partials (N, m, w) of row blocks with scaled columns."""
-    return np.concatenate([p.jacobian[rows] * inverse[p.columns_of(rows)][:, None, :] for p in c.parts], axis=2)
-
-
 def _rest_by_front(lin: Linearization, structure: Structure, inverse: Floats) -> dict[int, list[tuple[Ints, Floats]]]:
     out: dict[int, list[tuple[Ints, Floats]]] = {}
     for entry in structure.rest:
-        h = _scaled(lin.chunks[entry.chunk], entry.rows, inverse)
+        h = scaled_rows(lin.chunks[entry.chunk], entry.rows, inverse)
         order = np.argsort(entry.front, kind="stable")
         fronts, first = np.unique(entry.front[order], return_index=True)
         for f, some in zip(fronts, np.split(order, first[1:]), strict=True):

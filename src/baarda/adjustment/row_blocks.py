@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from baarda.adjustment.linear_system import Linearization
+from baarda.adjustment.linear_system import Chunk, Linearization
 from baarda.adjustment.structure import Structure
 
 Floats = NDArray[np.float64]
@@ -116,3 +116,8 @@ def sizes(structure: Structure, blocks: Blocks) -> Ints:
         ],
         dtype=np.intp,
     )  # fmt: skip
+
+
+def scaled_rows(c: Chunk, rows: Ints, inverse: Floats) -> Floats:
+    """Return the partials (N, m, w) of some row blocks of a chunk with scaled columns."""
+    return np.concatenate([p.jacobian[rows] * inverse[p.columns_of(rows)][:, None, :] for p in c.parts], axis=2)

@@ -19,10 +19,11 @@ from baarda.adjustment.initial import complete
 from baarda.adjustment.iteration import iterate
 from baarda.adjustment.linear_system import Linearization
 from baarda.adjustment.linearize import Arrangement, check_finite, linearize
+from baarda.adjustment.point_order import rank_for
 from baarda.adjustment.result import Adjustment, Iteration
 from baarda.adjustment.robust import adjust_under_law, check_law
 from baarda.adjustment.solver import Solver
-from baarda.adjustment.structure import analyse, inner_points, rank_for
+from baarda.adjustment.structure import analyse, inner_points
 from baarda.cameras import FREE
 from baarda.errors import DatumDefect, RedundancyNotPositive, UsageError
 from baarda.network import CHECK, Network, State, Unknowns, unknowns_of

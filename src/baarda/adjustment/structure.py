@@ -8,8 +8,6 @@ factorisation (Duff & Reid 1983); a cluster belongs to the front where its first
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -18,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 
+from baarda.adjustment.clusters import clusters_of, slices, stretch
 from baarda.adjustment.dissection import dissect
 from baarda.adjustment.linear_system import Chunk, Linearization
 from baarda.adjustment.linearize import kept_positions
@@ -27,12 +26,7 @@ Ints = NDArray[np.intp]
 Small = NDArray[np.int32]
 Bools = NDArray[np.bool_]
 
-BASE = 16  # points of the smallest cluster
-MOST = 1024  # points of the largest cluster
-LARGEST = 700_000  # points times columns of the largest cluster
-GROWTH = 1.1  # a cluster may grow while its width stays below this multiple of its widest part
 TASK = 20_000  # row blocks of one task
-SPARSE = 3.5  # clusters wider than this multiple of what a point of theirs touches are treated point by point
 
 
 @dataclass(frozen=True)
@@ -129,91 +123,21 @@ class Structure:
         """Front and clusters of tasks of some size, which share nothing; clusters without a node belong to the front -1."""
         blocks = np.diff(self.first_block[self.first_point])
         out = []
-        orphans = np.flatnonzero(np.diff(self.first_column) == 0)
-        for f, clusters in [*((f, front.clusters) for f, front in enumerate(self.fronts)), (-1, orphans)]:
+        for f, clusters in [*((f, front.clusters) for f, front in enumerate(self.fronts)), (-1, self.orphans)]:
             if len(clusters):
                 cuts = np.flatnonzero(np.diff(np.cumsum(blocks[clusters]) // TASK)) + 1
                 out += [(f, part) for part in np.split(clusters, cuts) if len(part)]
         return out
 
     @property
+    def orphans(self) -> Ints:
+        """The clusters that touch no node."""
+        return np.flatnonzero(np.diff(self.first_column) == 0)
+
+    @property
     def most_rows(self) -> int:
         """An upper bound of the row blocks of one point."""
         return int(np.diff(self.first_block).max(initial=0))
-
-
-def rank_of_points(coordinates: Floats) -> Ints:
-    """Return the rank of each point along a space-filling curve (Morton 1966), points without coordinates last.
-
-    Parameters
-    ----------
-    coordinates : (n, 3) array
-        Approximate coordinates; NaN = unknown.
-
-    Returns
-    -------
-    (n,) int array
-
-    Examples
-    --------
-    >>> rank_of_points(np.array([[0.0, 0.0, 0.0], [9.0, 9.0, 0.0], [1.0, 0.0, 0.0]]))
-    array([0, 2, 1])
-    """
-    known = np.isfinite(coordinates).all(axis=1)
-    key = np.full(len(coordinates), np.iinfo(np.int64).max)
-    if known.any():
-        x = coordinates[known]
-        size = np.maximum(np.quantile(x, 0.99, axis=0) - np.quantile(x, 0.01, axis=0), 1e-300)
-        low = np.quantile(x, 0.01, axis=0)
-        # one scale for all axes, so that cells are cubes and the relief of flat objects does not count
-        cells = np.floor(np.clip((x - low) / size.max(), 0.0, 1.0) * (2**20 - 1)).astype(np.int64)
-        key[known] = sum(_spread(cells[:, k]) << k for k in range(3))
-    rank = np.empty(len(key), dtype=np.intp)
-    rank[np.argsort(key, kind="stable")] = np.arange(len(key))
-    return rank
-
-
-def rank_for(groups: Sequence[Any], coordinates: Floats) -> Ints:
-    """Return the rank of points by place or by the images that see them, whichever puts points of the same images together.
-
-    Parameters
-    ----------
-    groups : sequence of observation groups
-    coordinates : (n, 3) array
-        Approximate coordinates; NaN = unknown.
-    """
-    seen = [g for g in groups if hasattr(g, "images") and hasattr(g, "points")]
-    by_place = rank_of_points(coordinates)
-    if not seen or not len(coordinates):
-        return by_place
-    images, points = np.concatenate([g.images for g in seen]), np.concatenate([g.points for g in seen])
-    first, last = np.full(len(coordinates), np.iinfo(np.intp).max), np.full(len(coordinates), -1)
-    np.minimum.at(first, points, images)
-    np.maximum.at(last, points, images)
-    by_image = np.empty(len(coordinates), dtype=np.intp)
-    by_image[np.lexsort((last, first))] = np.arange(len(coordinates))
-    return min((by_place, by_image), key=lambda rank: _spread_of_images(rank, images, points))
-
-
-def _spread_of_images(rank: Ints, images: Ints, points: Ints) -> float:
-    """Return how many images see the points of a small cluster, as a mean of squares over some of the clusters."""
-    base = rank[points] // BASE
-    some = base % max(1, (len(rank) // BASE) // 500) == 0
-    pairs = np.unique(base[some] * (int(images.max(initial=0)) + 1) + images[some])
-    return float(np.mean(np.unique(pairs // (int(images.max(initial=0)) + 1), return_counts=True)[1] ** 2.0))
-
-
-def _spread(x: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Put two zero bits between the bits of 20-bit numbers."""
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        x = (x | (x << shift)) & mask
-    return x
 
 
 def analyse(lin: Linearization, rank: Ints, coordinates: Floats, border: Ints | None = None) -> Structure:
@@ -245,7 +169,7 @@ def analyse(lin: Linearization, rank: Ints, coordinates: Floats, border: Ints | 
     owner = [place[c.parts[j].nodes] if j >= 0 else np.full(len(c.first), -1) for j, c in zip(part, lin.chunks, strict=True)]
     first_block, chunk, row = _blocks_by_point(owner, len(points))
     seen = [nodes.of_chunk(c) for c in lin.chunks]  # (N, parts) nodes of each row block
-    first_point, members, sparse = _clusters(first_block, chunk, row, seen, nodes)
+    first_point, members, sparse = clusters_of(first_block, chunk, row, seen, nodes.width)
     rest = [(i, np.flatnonzero(o < 0)) for i, o in enumerate(owner) if (o < 0).any()]
     cliques = [*members, *(m for i, rows in rest for m in _distinct(seen[i][rows]))]
     centres = _centres(coordinates[points], first_point)
@@ -399,73 +323,6 @@ def _blocks_by_point(owner: list[Ints], points: int) -> tuple[Ints, Small, Small
     return np.searchsorted(owners, np.arange(points + 1)).astype(np.intp), chunk, row
 
 
-def _slices(first: Ints, step: int) -> list[tuple[int, int]]:
-    """Split a list of ranges into stretches of `step` ranges."""
-    count = len(first) - 1
-    return [(a, min(a + step, count)) for a in range(0, count, step)]
-
-
-def _clusters(first_block: Ints, chunk: Small, row: Small, seen: list[Ints], nodes: _Nodes) -> tuple[Ints, list[Ints], Bools]:
-    """Gather neighbouring points that see nearly the same nodes: first point of each cluster, its nodes, whether it is sparse."""
-    count = len(first_block) - 1
-    cuts = np.append(np.arange(0, count, BASE), count) if count else np.zeros(1, dtype=np.intp)
-    seen_by: list[frozenset[int]] = []
-    for a, b in _slices(cuts, 256):
-        mark = np.zeros((b - a, nodes.count), dtype=bool)
-        for i, at, base in _stretch(first_block[cuts], a, b, chunk):
-            for j in range(seen[i].shape[1]):
-                number = seen[i][row[at], j]
-                mark[base[number >= 0], number[number >= 0]] = True
-        base, number = np.nonzero(mark)
-        ends, numbers = np.searchsorted(base, np.arange(b - a + 1)).tolist(), number.tolist()
-        seen_by += [frozenset(numbers[i:j]) for i, j in itertools.pairwise(ends)]
-    touched = _touched(first_block, chunk, row, seen, nodes).astype(float) ** 2
-    effort = np.concatenate([[0.0], np.cumsum(touched)])
-    width_of = nodes.width.tolist()
-    ends = cuts.tolist()
-    widths = [sum([width_of[i] for i in s]) for s in seen_by]
-    first, members, sparse = [0], [], []
-    k = 0
-    while k < len(seen_by):
-        union, end = seen_by[k], k + 1
-        width = widest = widths[k]
-        while end < len(seen_by) and ends[end + 1] - ends[k] <= MOST:
-            more = union | seen_by[end]
-            size = width + sum([width_of[i] for i in seen_by[end] - union])
-            widest = max(widest, widths[end])
-            if size > GROWTH * widest or size * (ends[end + 1] - ends[k]) > LARGEST:
-                break
-            union, width, end = more, size, end + 1
-        members.append(np.array(sorted(union), dtype=np.intp))
-        first.append(ends[end])
-        mean = (effort[ends[end]] - effort[ends[k]]) / (ends[end] - ends[k])
-        sparse.append(width > SPARSE * float(np.sqrt(mean)))
-        k = end
-    return np.array(first, dtype=np.intp), members, np.array(sparse, dtype=bool)
-
-
-def _touched(first_block: Ints, chunk: Small, row: Small, seen: list[Ints], nodes: _Nodes) -> Ints:
-    """Return an upper bound of the columns that each point touches: shared nodes counted once if they come last."""
-    width = np.append(nodes.width, 0)
-    per_block = np.zeros(len(chunk), dtype=np.intp)
-    for i, numbers in enumerate(seen):
-        at = np.flatnonzero(chunk == i)
-        per_block[at] = width[numbers[row[at]]].sum(axis=1)
-    total = np.concatenate([[0], np.cumsum(per_block)])
-    return np.asarray(total[first_block[1:]] - total[first_block[:-1]])
-
-
-def _stretch(first: Ints, a: int, b: int, chunk: Small) -> list[tuple[int, Ints, Ints]]:
-    """Return for each chunk the blocks of ranges a ... b, and the range (from a) of each."""
-    blocks = np.arange(first[a], first[b])
-    base = np.repeat(np.arange(b - a), np.diff(first[a : b + 1]))
-    own = chunk[first[a] : first[b]]
-    kinds = np.unique(own)
-    if len(kinds) == 1:
-        return [(int(kinds[0]), blocks, base)]
-    return [(int(i), blocks[own == i], base[own == i]) for i in kinds]
-
-
 def _distinct(sets: Ints) -> list[Ints]:
     """Return the different sets of nodes in the rows of an array; -1 = none."""
     rows = np.unique(np.sort(sets, axis=1), axis=0)
@@ -552,11 +409,11 @@ def _starts(seen: list[Ints], chunk: Small, row: Small, first: Ints, members: li
     sizes = np.cumsum([0, *(numbers.size for numbers in seen)])
     flat = np.full(sizes[-1], -1, dtype=np.int32)
     out = [flat[a:b].reshape(numbers.shape) for a, b, numbers in zip(sizes[:-1], sizes[1:], seen, strict=True)]
-    for a, b in _slices(first, 256):
+    for a, b in slices(first, 256):
         table = np.full((b - a, count + 1), -1, dtype=np.int32)
         for k in range(a, b):
             table[k - a, members[k]] = np.cumsum(widths[k]) - widths[k]
-        for i, at, base in _stretch(first, a, b, chunk):
+        for i, at, base in stretch(first, a, b, chunk):
             rows = row[at]
             out[i][rows] = table[base[:, None], seen[i][rows]]
     return flat
