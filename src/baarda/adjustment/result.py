@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from baarda.adjustment import tables
+from baarda.adjustment import estimates, tables
 from baarda.adjustment.covariance import Cofactors
 from baarda.adjustment.datum import Datum
 from baarda.adjustment.linear_system import Linearization
@@ -20,7 +20,7 @@ from baarda.adjustment.solver import Solver
 from baarda.errors import UsageError
 from baarda.geometry import rotation as rot
 from baarda.hypotheses.base import Estimates, Evidence
-from baarda.network import AXES, CHECK, Network, State, Table, Unknowns
+from baarda.network import Network, State, Table, Unknowns
 from baarda.observations import CorrelatedPoints, Direct, ImageCoordinates, ImagePoints, Kind
 
 if TYPE_CHECKING:
@@ -308,105 +308,19 @@ class Adjustment:
     @cached_property
     def camera_estimates(self) -> Estimates:
         """All estimated camera parameters with their joint cofactors."""
-        return self._camera_estimates(additional_only=False)
+        return estimates.of_cameras(self, additional_only=False)
 
     def camera_correlations(self, limit: float = 0.95) -> list[tuple[str, str, float]]:
         """Return the pairs of unknowns with a camera parameter whose correlation reaches the limit, the highest first.
 
         Camera parameters among themselves, and with the orientation unknowns of the images.
         """
-        e, group = self.camera_estimates, self.numbering["image"]
-        if not e.names:
-            return []
-        columns = np.array([self.numbering.column(name) for name in e.names], dtype=np.intp)
-        at = group.columns.reshape(-1, 6)
-        images = at[at >= 0]
-        variances = np.einsum("nii->ni", self.cofactors.blocks(at))[at >= 0]
-        others = np.concatenate([columns, images])
-        q = self.cofactors.of(others, columns)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            r = q / np.sqrt(np.outer(np.concatenate([np.diag(e.cofactors), variances]), np.diag(e.cofactors)))
-        r[: len(columns)] = np.tril(r[: len(columns)], -1)
-        rows, which = np.nonzero(np.abs(r) >= limit)
-        found = [(e.names[j], self.numbering.names[others[i]], float(r[i, j])) for i, j in zip(rows, which, strict=True)]
-        return sorted(found, key=lambda pair: -abs(pair[2]))
-
-    def _camera_estimates(self, additional_only: bool) -> Estimates:
-        group = self.numbering["camera"]
-        names, values, columns, labels = [], [], [], []
-        for i, camera in enumerate(self.network.cameras):
-            for k, name in enumerate(camera.model.order):
-                column = group.columns[group.offsets[i] + k]
-                if column >= 0 and (camera.model.additional[k] or not additional_only):
-                    names.append(f"camera {camera.label}: {name}")
-                    values.append(camera.values[k])
-                    columns.append(column)
-                    labels.append(camera.label)
-        at = np.array(columns, dtype=np.intp)
-        q = self.cofactors.of(at) if len(at) else np.zeros((0, 0))
-        return Estimates(tuple(names), np.array(values, dtype=float), 0.5 * (q + q.T), None, tuple(labels))
+        return estimates.camera_correlations(self, limit)
 
     @cached_property
     def additional_estimates(self) -> Estimates:
         """Additional camera parameters, and what declared groups call removable, with their joint cofactors."""
-        cameras = self._camera_estimates(additional_only=True)
-        names, values, labels = list(cameras.names), cameras.values.tolist(), list(cameras.groups)
-        for d in self.network.declared:
-            removable, columns = d.removable(), self.numbering[d.kind].columns
-            for node, label in enumerate(d.labels):
-                for k, name in enumerate(d.parameters_of(node), int(d.offsets[node])):
-                    if removable[k] and columns[k] >= 0:
-                        names.append(f"{d.kind} {label}: {name}")
-                        values.append(float(d.values[k]))
-                        labels.append(label)
-        if len(names) == len(cameras.names):
-            return cameras
-        q = self.cofactors.of(np.array([self.numbering.column(name) for name in names], dtype=np.intp))
-        return Estimates(tuple(names), np.array(values), 0.5 * (q + q.T), None, tuple(labels))
-
-    def _check_estimates(self) -> Estimates | None:
-        points = self.network.points
-        rows, axes = np.nonzero(((points.roles == CHECK) & ~self.aside)[:, None] & np.isfinite(points.given))
-        if not len(rows):
-            return None
-        q = self.cofactors.of(self.numbering["point"].columns.reshape(-1, 3)[rows, axes])
-        covariance = points.covariance(np.arange(len(points.labels)))
-        same = rows[:, None] == rows[None, :]
-        reference = np.where(same, np.nan_to_num(covariance[rows[:, None], axes[:, None], axes[None, :]]), 0.0)
-        return Estimates(
-            tuple(f"point {points.labels[i]}: {AXES[k]}" for i, k in zip(rows, axes, strict=True)),
-            points.coordinates[rows, axes] - points.given[rows, axes],
-            0.5 * (q + q.T),
-            reference,
-            tuple(points.labels[i] for i in rows),
-        )
-
-    def _control_estimates(self) -> Estimates | None:
-        columns, names, labels, rows, cofactors = [], [], [], [], []
-        numbering = self.numbering["point"].columns.reshape(-1, 3)
-        for g, group in enumerate(self.groups):
-            if isinstance(group, Direct) and group.kind == "point":
-                nodes, axes = group.nodes, group.positions
-                cofactors.append(np.diag(group.sigmas**2))
-            elif isinstance(group, CorrelatedPoints):
-                nodes, axes = np.repeat(group.nodes, 3), np.tile(np.arange(3), len(group))
-                q = np.zeros((3 * len(group), 3 * len(group)))
-                for i, c in enumerate(group.covariances):
-                    q[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = c
-                cofactors.append(q)
-            else:
-                continue
-            columns.append(numbering[nodes, axes])
-            labels += [self.network.points.labels[i] for i in nodes]
-            names += [f"point {self.network.points.labels[i]}: {AXES[k]}" for i, k in zip(nodes, axes, strict=True)]
-            rows.append(np.arange(self.offsets[g], self.offsets[g + 1]))
-        if not columns:
-            return None
-        from scipy.linalg import block_diag
-
-        prior = block_diag(*cofactors)
-        q = prior - self.cofactors.of(np.concatenate(columns))
-        return Estimates(tuple(names), self.residuals[np.concatenate(rows)], 0.5 * (q + q.T), prior, tuple(labels))
+        return estimates.removable(self)
 
     @cached_property
     def evidence(self) -> Evidence:
@@ -442,8 +356,8 @@ class Adjustment:
             component_names=names,
             additional=additional if additional.names else None,
             interior=interior if interior.names else None,
-            check=self._check_estimates(),
-            control=self._control_estimates(),
+            check=estimates.of_check_points(self),
+            control=estimates.of_control(self),
             residuals_of=self.residuals_of,
         )
         if self.law is None:
