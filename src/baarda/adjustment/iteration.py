@@ -70,13 +70,13 @@ def iterate(
         step, change = _step(lin, solver, datum, lin.misclosure)
         predicted = 2.0 * float(change @ lin.misclosure) - float(change @ change)
         relative = float(np.linalg.norm(change) / np.sqrt(max(objective, floor)))
-        lengthened = 1.0
+        lengthened, plain = 1.0, before is not None
         if damping == 0.0 and before is not None and relative < 0.01:
             lengthened = _extrapolated(change, before)
-            step = lengthened * step
+            step, plain = lengthened * step, lengthened == 1.0
             predicted = 2.0 * lengthened * float(change @ lin.misclosure) - lengthened**2 * float(change @ change)
         if lengthened == 1.0 and relative > max(BEND, 0.1 * last if np.isfinite(last) else 0.0):  # steps that shrink fast need no bending
-            step = _bent(lin, solver, datum, step, change, lambda x: misclosures(x)[1])
+            step, plain = _bent(lin, solver, datum, step, change, lambda x: misclosures(x)[1]), False
         near = damping == 0.0 and (relative <= NEAR or trusted)
         if near:  # as good as sure to be taken: linearised at once
             trial, solver = moved(step), solver.at(None)
@@ -107,8 +107,8 @@ def iterate(
             del lin
             lin = linearize(network, state, unknowns, groups, workers)
         stalled = stalled + 1 if relative <= 1e-7 and relative >= 0.8 * last else 0
-        rate = relative / last if damping == 0.0 and np.isfinite(last) and relative < 0.1 * last else 1.0
-        left = relative * rate  # the next step, by the rate of the last two
+        rate = 10.0 * relative / last if plain else 1.0
+        left = relative * min(rate, 1.0)  # the next step by the rate of the last two, if they were plain ones, with caution
         settled = left <= settings.tolerance or stalled == 2 or (relative < 1e-9 and relative >= 0.5 * last)  # only rounding is left
         if settled and (damping == 0.0 or _full_step(lin, tied, factor) <= 1e-6):
             return state, lin, history, True
