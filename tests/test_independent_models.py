@@ -24,6 +24,7 @@ from baarda.procedures.independent_models import (
     bundle_of_models,
     simulate_strip,
 )
+from baarda.procedures.testing import analyse
 
 # ---- refinement -----------------------------------------------------------------------------------------------------------------------
 
@@ -250,14 +251,63 @@ def test_bundle_of_the_chain_is_the_direct_bundle(noisy, chain):
         )
     )
     assert a.objective == pytest.approx(direct.objective, rel=1e-9)
-    assert a.network.points.coordinates == pytest.approx(direct.network.points.coordinates, abs=1e-6)
+    assert a.network.points.coordinates == pytest.approx(direct.network.points.coordinates, abs=1e-9)
+    assert a.network.images.position == pytest.approx(direct.network.images.position, abs=1e-9)
+    assert a.network.images.rotation == pytest.approx(direct.network.images.rotation, abs=1e-12)
     assert a.residuals == pytest.approx(direct.residuals, abs=1e-9)
+    assert a.unknowns["sigma"] == pytest.approx(direct.unknowns["sigma"], rel=1e-9)
+    assert a.redundancy_numbers == pytest.approx(direct.redundancy_numbers, abs=1e-9)
     without = adjust(chain.network.__class__(**{**vars_of(chain.network), "images": Images.make(chain.network.images.labels)}))
     assert without.objective == pytest.approx(direct.objective, rel=1e-9)
 
 
 def vars_of(network):
     return {k: getattr(network, k) for k in ("cameras", "images", "points", "observations", "unit", "name", "settings", "declared")}
+
+
+SYSTEMATIC = {
+    "radial": lambda xy: refinement.correct_radial(xy, [2e-7, -3e-12]),
+    "decentring": lambda xy: refinement.correct_decentring(xy, 2e-6, -1e-6),
+    "refraction": lambda xy: refinement.correct_refraction(xy, 152.4, 1500.0),
+    "curvature": lambda xy: refinement.correct_earth_curvature(xy, 152.4, 1500.0),
+    "film": refinement.film_deformation(SHRUNK, MARKS).correct,
+}
+
+
+@pytest.mark.parametrize("name", [*SYSTEMATIC, "all"])
+def test_refinement_undoes_what_was_simulated(name):
+    """Systematic errors, alone and together: refined coordinates recover the truth to 1e-6 m, raw ones do not."""
+
+    def correct(xy):
+        for each in SYSTEMATIC.values() if name == "all" else [SYSTEMATIC[name]]:
+            xy = each(xy)
+        return xy
+
+    def away(a, truth):
+        labels = a.network.points.labels
+        return max(np.abs(a.network.points.coordinates[i] - truth[label]).max() for i, label in enumerate(labels))
+
+    # image coordinates as a camera with these errors measures them, raw and refined, in the bundle
+    made = simulate_strip(5, seed=9)
+    exact = adjust_chain(made.models, made.control, made.principal_distance, 0.005).network
+    spoiled = [replace(g, xy=inverse(correct, g.xy)) for g in exact.observations]
+    refined = [replace(g, xy=correct(g.xy)) for g in spoiled]
+    raw, good = (away(adjust(replace(exact, observations=tuple(groups))), made.truth) for groups in (spoiled, refined))
+    assert good < 1e-6
+    assert raw > (1e-3 if name in ("refraction", "curvature") else 1e-1)
+    # models that were formed of spoiled coordinates have lost the parallaxes these made: refined later, errors become smaller, not zero
+    late = simulate_strip(5, distort=lambda xy: inverse(correct, xy), seed=9)
+    settings = (late.models, late.control, late.principal_distance, 0.005)
+    raw, good = (away(adjust_chain(*settings, refine=r).adjustment, late.truth) for r in (None, correct))
+    assert good < 0.7 * raw
+
+
+def test_residuals_of_the_chain_go_on_to_the_study(chain):
+    """U: moments, laws of errors, and null laws through the adjustment."""
+    study = analyse(chain.adjustment).study
+    assert len(study.laws.laws) >= 3
+    assert {"normal", "lineo"} <= {s.fit.law for s in study.laws.laws}
+    assert study.laws.laws[0].test("anderson_darling").p_value > 0.001
 
 
 def test_refinement_within_the_chain():

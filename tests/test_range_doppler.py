@@ -94,7 +94,7 @@ def test_intersection_inverts_projection(side):
             np.array([spacing[i] * r[i] + delay[i], spacing[i] * r2[i] + delay[i]]),
             points[i] + [100.0, -50.0, -80.0],
         )
-        assert np.abs(x - points[i]).max() < 1e-8
+        assert np.abs(x - points[i]).max() < 1e-9
 
 
 def test_a_circle_that_does_not_reach_the_plane():

@@ -1,5 +1,6 @@
 """Monte Carlo: sigmas of radar unknowns and intersected points, and how often the strategy deletes a term that is truly zero."""
 
+import functools
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from baarda.observations import Tracks
 from baarda.papers.wu import deletion_rate
 from baarda.procedures.camera_selection import select_parameters
 from baarda.procedures.criteria import falls_below
-from baarda.procedures.radar_simulation import PIXEL, SPEED, planimetry, simulate_radar
+from baarda.procedures.radar_simulation import DEVIATIONS, LENGTH, PIXEL, SPEED, planimetry, simulate_radar
 
 pytestmark = pytest.mark.sampling
 FINE = (PIXEL / SPEED / 4.0, 0.25)  # so small that the model is linear within its sigmas
@@ -99,3 +100,88 @@ def test_rate_of_deletion():
         found, _ = select_parameters(replace(network, declared=(restricted(network.declared[0], "Z4"),)))
         deleted += bool(found.deleted)
     assert abs(deleted / replicas - rate) < 4.0 * np.sqrt(rate * (1.0 - rate) / replicas)
+
+
+def test_points_of_one_spaceborne_track():
+    """Range, Doppler and a height above the ellipsoid: squared errors of the points are as large as predicted."""
+    from test_ellipsoid_heights import block
+
+    ratio = []
+    for k in range(60):
+        network, true, _ = block(500 + k)
+        a = adjust(network)
+        tie = np.flatnonzero(a.network.points.roles != CONTROL)
+        e = (a.network.points.coordinates - true)[tie]
+        ratio.append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(a.point_cofactors[tie]), e).mean() / 3.0)
+    assert abs(np.mean(ratio) - 1.0) < 4.0 * np.std(ratio, ddof=1) / np.sqrt(60)
+
+
+def test_rate_of_keeping():
+    """One candidate whose true value is three of its standard deviations: kept as often as the noncentral F law says (0.95)."""
+    end, replicas, kept, r = 0.5 * LENGTH / SPEED, 100, 0, 54
+    still = np.array(DEVIATIONS)
+    planned = adjust(without(simulate_radar(1, noise=FINE), ("Z3",)))
+    sigma = float(np.sqrt(planned.covariance("track 1: Z4", sigma="apriori")))
+    still[2, 2] = 3.0 * sigma * end**4
+    limit = max(falls_below(name, 70, r) for name in ("variance_factor", "criterion_b", "aic"))
+    rate = float(stats.ncf(1, r, 9.0).sf(limit))
+    for k in range(replicas):
+        network = without(simulate_radar(20_000 + k, noise=FINE, deviations=still), ("Z3",))
+        found, _ = select_parameters(replace(network, declared=(restricted(network.declared[0], "Z4"),)))
+        kept += not found.deleted
+    assert 0.9 < rate < 0.99
+    assert abs(kept / replicas - rate) < 4.0 * np.sqrt(rate * (1.0 - rate) / replicas)
+
+
+@functools.cache
+def deletion_limit(n, r):
+    """F below which the strategy deletes: the F test proposes, the most willing criterion decides."""
+    willing = max(falls_below(name, n, r) for name in ("variance_factor", "criterion_b", "aic"))
+    return min(float(stats.f.isf(0.05, 1, r)), willing)
+
+
+def strategy(x, q, omega, n, r):
+    """The strategy on a linear model: estimates, their cofactors, v'Pv; return which candidates are deleted."""
+    left, gone = list(range(len(x))), []
+    x, q = x.copy(), q.copy()
+    while left:
+        f = x[left] ** 2 / (np.diag(q)[left] * omega / r)
+        i = left[int(np.argmin(f))]
+        if f.min() > deletion_limit(n, r):
+            break
+        omega += x[i] ** 2 / q[i, i]
+        x, q = x - q[:, i] / q[i, i] * x[i], q - np.outer(q[:, i], q[:, i]) / q[i, i]
+        left.remove(i)
+        gone.append(i)
+        r += 1
+    return tuple(sorted(gone))
+
+
+@dataclass(frozen=True)
+class RestrictedTwo(Tracks):
+    """Tracks whose candidates are the two altitude terms that are truly zero."""
+
+    def removable(self):
+        return np.array([name in ("Z3", "Z4") for node in range(len(self.labels)) for name in self.parameters_of(node)])
+
+
+def test_both_true_zeros_are_removed_at_the_rate_of_the_linear_model():
+    """c3 = c4 = 0: no term, one, or both are deleted as often as the strategy deletes them from normal estimates of the same cofactors."""
+    replicas = 100
+    a = adjust(without(simulate_radar(1, noise=FINE), ()))
+    q = a.covariance(["track 1: Z3", "track 1: Z4"], sigma="apriori")
+    rng = np.random.default_rng(5)
+    root, rates = np.linalg.cholesky(q), {}
+    for _ in range(20_000):
+        gone = strategy(root @ rng.standard_normal(2), q, rng.chisquare(53), 70, 53)
+        rates[gone] = rates.get(gone, 0.0) + 1.0 / 20_000
+    counts = dict.fromkeys(rates, 0)
+    for k in range(replicas):
+        network = without(simulate_radar(30_000 + k, noise=FINE), ())
+        group = network.declared[0]
+        two = RestrictedTwo(**{f.name: getattr(group, f.name) for f in fields(group)})
+        found, _ = select_parameters(replace(network, declared=(two,)))
+        gone = tuple(sorted(("Z3", "Z4").index(name.split(": ")[1]) for name in found.deleted))
+        counts[gone] = counts.get(gone, 0) + 1
+    for gone, rate in rates.items():
+        assert abs(counts[gone] / replicas - rate) < 4.0 * np.sqrt(rate * (1.0 - rate) / replicas), (gone, counts, rates)

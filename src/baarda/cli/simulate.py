@@ -18,6 +18,7 @@ from baarda.cli.base import (
     FormatName,
     ImageSigma,
     Json,
+    Language,
     MinRays,
     Out,
     Plane,
@@ -38,7 +39,7 @@ KINDS = ("aerial", "ring", "long-tracks", "dense")
 @guarded
 def simulate(
     project: Annotated[
-        str, typer.Argument(metavar="PROJECT|KIND", help="A planned network of any format, or aerial, ring, long-tracks, dense.")
+        str, typer.Argument(metavar="PROJECT|KIND", help="A planned network of any format, or aerial, ring, long-tracks, dense, radar.")
     ],
     out: Out = None,
     replicas: Annotated[int, typer.Option("--replicas", help="Prove the predictions by so many replicas.", min=0)] = 0,
@@ -67,28 +68,33 @@ def simulate(
     power: Power = 0.80,
     seed: Seed = 0,
     tables: Tables = "csv",
+    language: Language = "en",
     as_json: Json = False,
     quiet: Quiet = False,
     strict: Strict = False,
 ) -> None:
     """Predict precision and reliability of a planned network, prove them by replicas; or make a block with known truth."""
+    if project == "radar":
+        make_radar(out, quiet, 35 if points is None else points, noise, seed)
+        return
     if project.replace("_", "-") in KINDS:
         options = {"points": points, "checks": checks, "control": control_points, "noise": noise, "perturbation": perturbation}
         make(project, images, out, quiet, {**options, "model": model, "per_image_cameras": per_image_cameras, "seed": seed})
         return
     from baarda.cli.adjust import camera_list
-    from baarda.errors import UsageError
     from baarda.formats import read
     from baarda.formats.folder import check_target
     from baarda.hypotheses.levels import Options
     from baarda.procedures.planning import plan
     from baarda.procedures.proof import prove
     from baarda.procedures.simulation import simulate as run_replicas
+    from baarda.report import translation
+    from baarda.report.contents import check_tables
     from baarda.report.simulation_report import MARK, result_json, verdict, write_folder
 
     started = time.perf_counter()
-    if tables not in ("csv", "parquet"):
-        raise UsageError(f"--tables is csv or parquet, not {tables!r}")
+    check_tables(tables)
+    translation.check_language(language)
     target = None if as_json and out is None else out or Path("baarda-simulation")
     if target is not None:
         check_target(target, MARK)
@@ -113,12 +119,13 @@ def simulate(
         begun = time.perf_counter()
         proof = prove(run_replicas(planned, replicas, seed, jobs, None if quiet else progress, **settings))
     if target is not None:
-        write_folder(planned, proof, target, tables, {"seconds": round(time.perf_counter() - started, 3), "jobs": jobs})
+        write_folder(planned, proof, target, tables, {"seconds": round(time.perf_counter() - started, 3), "jobs": jobs}, language)
     if as_json:
         typer.echo(json.dumps(result_json(planned, proof), indent=1, allow_nan=False, ensure_ascii=False))
     elif not quiet:
-        for sentence in verdict(planned, proof):
-            typer.echo(sentence)
+        with translation.language(language):
+            for sentence in verdict(planned, proof):
+                typer.echo(sentence)
     if target is not None and not quiet:
         typer.echo(f"report: {target / 'report.html'}", err=True)
     if strict and proof is not None and not proof.holds:
@@ -143,3 +150,21 @@ def make(kind: str, images: int, out: Path | None, quiet: bool, options: dict[st
         typer.echo(
             f"{out}: {images} images, {len(block.network.points.labels)} object points, {rows} observations (image points, distances)"
         )
+
+
+def make_radar(out: Path | None, quiet: bool, points: int, noise: float, seed: int) -> None:
+    """Write the radar image of Yangmei (Wu 2000) as a project, noise in r in pixels, and as much on the ground in t."""
+    from baarda.errors import UsageError
+    from baarda.formats.folder import check_target
+    from baarda.formats.project import write
+    from baarda.procedures.radar_simulation import PIXEL, SPEED, simulate_radar
+
+    if out is None:
+        raise UsageError("simulate radar makes a project: say where (--out DIR)")
+    if points < 1 or not noise > 0.0:
+        raise UsageError(f"a radar image needs points and noise, not {points} and {noise}")
+    check_target(out)
+    made = simulate_radar(seed, (noise * PIXEL / SPEED, noise), points)
+    write(made.network, out)
+    if not quiet:
+        typer.echo(f"{out}: one radar image, {points} control points, {2 * points} observations")

@@ -63,7 +63,17 @@ class GroupTable(_Strict):
 
     name: Annotated[str, Field(min_length=1)]
     kind: Literal[
-        "image_points", "distances", "directions", "angles", "height_differences", "camera_positions", "range_doppler", "model_coordinates"
+        "image_points",
+        "distances",
+        "directions",
+        "angles",
+        "height_differences",
+        "camera_positions",
+        "ellipsoid_heights",
+        "range_doppler",
+        "model_coordinates",
+        "model_plan",
+        "model_heights",
     ] = "image_points"
     sigma: Sigma | None = None
     residual_plane: Plane | None = None

@@ -19,7 +19,18 @@ from baarda.formats.checks import correlations, sigma_range
 from baarda.formats.csv_table import CsvTable, numbers_text, quoted
 from baarda.formats.vector_tables import VECTOR_TABLES, VectorTable
 from baarda.network import AXES, Declared, Images, Network, Points
-from baarda.observations import Angles, CameraPositions, Directions, HeightDifferences, LeverArms, Models, Stations, Strips, Tracks
+from baarda.observations import (
+    Angles,
+    CameraPositions,
+    Directions,
+    EllipsoidHeights,
+    HeightDifferences,
+    LeverArms,
+    Models,
+    Stations,
+    Strips,
+    Tracks,
+)
 
 Floats = NDArray[np.float64]
 Columns = dict[str, list[str]]
@@ -162,6 +173,7 @@ KIND_TABLES: dict[str, KindTable | PositionTable | VectorTable] = {
         KindTable("directions", Directions, {"from": "starts", "to": "ends"}, {"station": ("sets", "station")}, in_units=False),
         KindTable("angles", Angles, {"from": "starts", "back": "backs", "fore": "fores"}, {}, in_units=False),
         KindTable("height_differences", HeightDifferences, {"from": "starts", "to": "ends"}, {}, in_units=True),
+        KindTable("ellipsoid_heights", EllipsoidHeights, {"point": "points"}, {}, in_units=True),
         *VECTOR_TABLES,
     )
 }

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from baarda.formats.checks import sigma_range
 from baarda.formats.csv_table import CsvTable, numbers_text, quoted
 from baarda.network import Declared, Images, Network, Points
+from baarda.observations.model_components import ModelHeights, ModelPlan
 from baarda.observations.model_coordinates import ModelCoordinates
 from baarda.observations.range_doppler import RangeDoppler
 
@@ -116,5 +117,21 @@ VECTOR_TABLES = (
         ("x", "y", "z"),
         lambda node, point, values, sigma, unit: ModelCoordinates(node, point, values, sigma),
         lambda group: (group.models, group.points, group.xyz),
+    ),
+    VectorTable(
+        "model_plan",
+        ModelPlan,
+        "model",
+        ("x", "y"),
+        lambda node, point, values, sigma, unit: ModelPlan(node, point, values, sigma),
+        lambda group: (group.models, group.points, group.values),
+    ),
+    VectorTable(
+        "model_heights",
+        ModelHeights,
+        "model",
+        ("z",),
+        lambda node, point, values, sigma, unit: ModelHeights(node, point, values, sigma),
+        lambda group: (group.models, group.points, group.values),
     ),
 )

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from baarda.errors import Singular, UsageError
+from baarda.geometry.ellipsoid_height import ellipsoid_height
 
 Floats = NDArray[np.float64]
 Side = Literal["left", "right"]
@@ -236,6 +237,62 @@ def intersect_height(position: ArrayLike, velocity: ArrayLike, squint: ArrayLike
     out[:, :, 2] = z[:, None]
     for k, sign in enumerate((1.0, -1.0)):
         out[:, k, :2] = p[:, :2] + ahead[:, None] * forward + sign * aside[:, None] * left
+    return np.where(np.isfinite(out).all(axis=2, keepdims=True), out, np.nan)
+
+
+def intersect_ellipsoid(position: ArrayLike, velocity: ArrayLike, squint: ArrayLike, distance: ArrayLike, height: ArrayLike) -> Floats:
+    """Intersect one range circle with a surface of constant height above the ellipsoid: the points left and right of the flight.
+
+    Parameters
+    ----------
+    position, velocity : (n, 3) array_like
+        Of the antenna, geocentric, m and m per unit of time.
+    squint, distance, height : (n,) array_like
+        Squint angle (radians), slant range, and given height of the point above the ellipsoid of WGS 84, m.
+
+    Returns
+    -------
+    (n, 2, 3) array
+        The point to the left, and that to the right, seen from above; NaN where the circle does not reach the surface.
+
+    Notes
+    -----
+    Closed form on the sphere through the foot of the antenna, then Newton steps on range, Doppler and height. Like `intersect_height`, it
+    cannot tell left from right.
+
+    Examples
+    --------
+    >>> found = intersect_ellipsoid([[7e6, 0, 0]], [[0, 0, 7000.0]], [0.0], [8e5], [0.0])[0]
+    >>> found[:, 1].round(-3).tolist()
+    [-480000.0, 480000.0]
+    """
+    p, v = np.asarray(position, dtype=float).reshape(-1, 3), np.asarray(velocity, dtype=float).reshape(-1, 3)
+    rho, angle, h = (np.asarray(a, dtype=float).reshape(-1) for a in (distance, squint, height))
+    u, above = v / _norm(v)[:, None], _norm(p)
+    foot = above - ellipsoid_height(p)[0]  # radius of the ellipsoid below the antenna, nearly
+    up = p / above[:, None]
+    side = np.cross(up, u)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        side = side / _norm(side)[:, None]
+        along = np.cross(side, up)  # level, forwards
+        down = ((foot + h) ** 2 - above**2 - rho**2) / (2.0 * above)
+        ahead = (rho * np.sin(angle) - np.sum(u * up, axis=1) * down) / np.sum(u * along, axis=1)
+        aside = np.sqrt(rho**2 - down**2 - ahead**2)
+    out = np.empty((len(p), 2, 3))
+    for k, sign in enumerate((1.0, -1.0)):
+        x = p + down[:, None] * up + ahead[:, None] * along + sign * aside[:, None] * side
+        for _ in range(8):  # from the sphere, Newton's steps double the digits
+            good = np.flatnonzero(np.isfinite(x).all(axis=1))
+            d = x[good] - p[good]
+            reach, sine = _norm(d), np.sin(angle[good])
+            found, normal = ellipsoid_height(x[good])
+            misfit = np.stack([reach - rho[good], np.sum(u[good] * d, axis=1) - reach * sine, found - h[good]], axis=1)
+            e = d / reach[:, None]
+            a = np.stack([e, u[good] - sine[:, None] * e, normal], axis=1)
+            crosses = np.abs(np.linalg.det(a)) > 1e-12
+            x[good[~crosses]] = np.nan  # the circle touches the surface
+            x[good[crosses]] -= np.linalg.solve(a[crosses], misfit[crosses][:, :, None])[:, :, 0]
+        out[:, k] = x
     return np.where(np.isfinite(out).all(axis=2, keepdims=True), out, np.nan)
 
 

@@ -89,3 +89,16 @@ class Kind(Protocol):
 
     def labels(self, network: Network) -> dict[str, Any]:
         """Return the codes of image and point and the component of each row block for the observation table."""
+
+
+def component_unit(group: Any, component: int) -> str:
+    """Return the unit of one component of an observation group: from its `units`, one per component, where it has them, else its `unit`.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> component_unit(SimpleNamespace(unit="s, px", units=("s", "px")), 1), component_unit(SimpleNamespace(unit="m"), 1)
+    ('px', 'm')
+    """
+    units = getattr(group, "units", None)
+    return str(group.unit if units is None else units[component])

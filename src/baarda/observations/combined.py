@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from baarda.observations.base import Block, Floats, Ints, Rows
 
@@ -96,23 +97,36 @@ def demanded(conditions: Conditions, observed: Floats, cofactor: Floats, steps: 
     array([[-3., -4.]])
     """
     size = np.sqrt(np.einsum("nii->ni", cofactor) if cofactor.ndim == 3 else cofactor)
+    with np.errstate(all="ignore"):
+        v, settled = _iterated(conditions, observed, cofactor, size, steps, 1.0)
+        _, b = conditions(observed + v)
+        for part in (0.5, 0.2) if b.shape[1] < b.shape[2] else ():  # far from a strongly curved surface full steps swing
+            if settled.all():
+                break
+            other, there = _iterated(conditions, observed, cofactor, size, int(steps / part), part)
+            v, settled = np.where((there & ~settled)[:, None], other, v), settled | there
+            _, b = conditions(observed + v)
+    return np.where(settled[:, None], v, np.nan), b
+
+
+def _iterated(
+    conditions: Conditions, observed: Floats, cofactor: Floats, size: Floats, steps: int, part: float
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Iterate with a part of each step; return the residuals, and which row blocks have settled."""
     v = np.zeros_like(observed)
     last = np.full(len(observed), np.inf)
     moving = np.ones(len(observed), dtype=bool)
-    with np.errstate(all="ignore"):
-        for _ in range(steps):
-            f, b = conditions(observed + v)
-            new = np.einsum("nkm,nm->nk", gain(b, cofactor), np.einsum("nmk,nk->nm", b, v) - f)
-            step = np.max(np.abs(new - v) / size, axis=1)
-            # rounding is reached where small steps no longer shrink
-            moving &= ~((step == 0.0) | ((step <= 1e-7) & (step >= 0.9 * last)))
-            if not moving.any():
-                break
-            v = np.where(moving[:, None], new, v)
-            last = np.where(moving, step, last)
+    for _ in range(steps):
         f, b = conditions(observed + v)
-    settled = np.isfinite(v).all(axis=1) & (~moving | (last <= 1e-9))
-    return np.where(settled[:, None], v, np.nan), b
+        new = v + part * (np.einsum("nkm,nm->nk", gain(b, cofactor), np.einsum("nmk,nk->nm", b, v) - f) - v)
+        step = np.max(np.abs(new - v) / size, axis=1)
+        # rounding is reached where small steps no longer shrink
+        moving &= ~((step == 0.0) | ((step <= 1e-7) & (step >= 0.99 * last)))
+        if not moving.any():
+            break
+        v = np.where(moving[:, None], new, v)
+        last = np.where(moving, step, last)
+    return v, np.isfinite(v).all(axis=1) & (~moving | (last <= 1e-9 * part))
 
 
 def rows(index: Ints, residuals: Floats, condition: Floats, cofactor: Floats, unknowns: Sequence[tuple[str, Ints, Floats]]) -> Rows:

@@ -25,7 +25,8 @@ PARAMETERS = ("X0", "Y0", "Z0", "rotation_x", "rotation_y", "rotation_z", "scale
 class Models(Declared):
     """Transformations of models: x = scale R (X - X0), R the rotation of the vector (rotation_x, rotation_y, rotation_z).
 
-    Increments of the rotation are about the axes of the model. A value that is NaN is found from common points.
+    Increments of the rotation are about the axes of the model; a state belongs to the increment about its axis. A value that is NaN is
+    found from common points.
     """
 
     starts_itself: ClassVar[bool] = True
@@ -35,9 +36,10 @@ class Models(Declared):
         if any(names != PARAMETERS for names in self.parameters):
             raise UsageError(f"a model has the parameters {', '.join(PARAMETERS)}")
         states = self.states.reshape(-1, 7)
-        turned = (states[:, 3:6] == OBSERVED).any(axis=1) | (states[:, 3:6] != states[:, 3:4]).any(axis=1)
+        turned = (states[:, 3:6] == OBSERVED).any(axis=1) | (states[:, 3] != states[:, 4])
         if turned.any():
-            raise UsageError(f"model {self.labels[int(np.argmax(turned))]}: the rotation is free or fixed as a whole")
+            label = self.labels[int(np.argmax(turned))]
+            raise UsageError(f"model {label}: the rotation is free or fixed as a whole, or both tilts are (rotation_x and rotation_y)")
 
     @property
     def rotations(self) -> Floats:

@@ -244,6 +244,11 @@ class RangeDoppler:
 
     components = ("t", "r")
 
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of t, and of r."""
+        return tuple(self.unit.split(", "))
+
     def __len__(self) -> int:
         return len(self.points)
 

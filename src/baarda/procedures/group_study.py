@@ -142,7 +142,34 @@ def study_groups(
     usable = df > UNCONTROLLED
     variances = np.divide(sums, df, out=np.full(k, np.nan), where=usable)
     means = np.where(counts > 0, means, np.nan)
-    made = Groups(names, codes, counts, means, variances, df, r is not None)
+    return compare_groups(Groups(names, codes, counts, means, variances, df, r is not None), x, o)
+
+
+def compare_groups(made: Groups, x: Floats, o: StudyOptions) -> tuple[Groups, list[tuple[str, str]]]:
+    """Add the tests of equal variances to groups.
+
+    Parameters
+    ----------
+    made : Groups
+        Without tests.
+    x : (n,) array
+        The values studied; none where only their sums are known, which leaves out the test of Brown and Forsythe.
+    o : StudyOptions
+
+    Returns
+    -------
+    Groups
+    left_out : list of (str, str)
+        What could not be tested, and why.
+
+    Examples
+    --------
+    >>> none = np.zeros(0, dtype=np.intp)
+    >>> two = Groups(("a", "b"), none, np.array([9, 9]), np.zeros(2), np.array([1.0, 4.0]), np.array([8.0, 8.0]), False)
+    >>> [t.name for t in compare_groups(two, np.zeros(0), StudyOptions())[0].tests]
+    ['bartlett', 'bartlett_uncorrected', 'variance_per_group']
+    """
+    names, k, usable, variances = made.names, len(made.names), made.df > UNCONTROLLED, made.variances
     left_out: list[tuple[str, str]] = []
     if not usable.all():
         lost = [names[i] for i in np.flatnonzero(~usable)]

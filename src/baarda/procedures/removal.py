@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from baarda.adjustment import Adjustment
 from baarda.cameras import FREE
 from baarda.network import TIE, Images, Network, State
-from baarda.observations import CorrelatedPoints, Direct, ImageCoordinates, ImagePoints, direct_observations
+from baarda.observations import CorrelatedPoints, Direct, ImageCoordinates, ImagePoints, component_unit, direct_observations
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -249,7 +249,7 @@ def predict(adjustment: Adjustment, base: Network, keys: Sequence[Key]) -> Predi
                         cofactors[j, other] = found.cofactor[n, c, d] if found.cofactor.ndim == 3 else (c == d) * found.cofactor[n, c]
         for j, (i, c) in here.items():
             observed[j], sigmas[j] = values[i, c], deviations[i, c]
-            units[j], names[j] = part.unit, part.name
+            units[j], names[j] = component_unit(part, c), part.name
             components[j] = str(labels["component"][i]) if "component" in labels else part.components[c]
             for kind, code in codes.items():
                 if kind in labels:

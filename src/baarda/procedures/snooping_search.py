@@ -19,6 +19,7 @@ from baarda.hypotheses.levels import Options, baarda_level, single_level
 from baarda.hypotheses.outliers import UNCONTROLLED, delta0, externally_studentised
 from baarda.hypotheses.separability import separable_delta, wrong_choice
 from baarda.network import Network, Table
+from baarda.observations import component_unit
 from baarda.procedures.error_law import critical_values
 from baarda.procedures.removal import Key, Predicted, keys_of, predict, without
 from baarda.procedures.snooping_steps import Snooping, SnoopStep
@@ -344,7 +345,8 @@ class Search:
 
     def _unit_of(self, row: int) -> str:
         g = int(np.searchsorted(self.a.offsets, row, side="right")) - 1
-        return str(self.a.groups[g].unit)
+        group = self.a.groups[g]
+        return component_unit(group, (row - int(self.a.offsets[g])) % len(group.components))
 
     def _step(self, action: str, told: dict[str, Any], note: str) -> None:
         step = SnoopStep(step=len(self.steps) + 1, action=action, sigma0=self.a.sigma0, redundancy=self.a.redundancy, note=note, **told)
