@@ -64,7 +64,7 @@ def test_the_reference_model():
     begin = time.perf_counter()
     n = formats.read(data_folder("colmap_sceaux_txt"))
     assert time.perf_counter() - begin < 4.0  # 0.3 s on an idle machine
-    assert n.format == "colmap" and n.unit == "model units" and dict(n.settings) == {}
+    assert n.format == "colmap" and n.unit == "model units" and dict(n.settings) == {"first_pixel": 0.5}
     assert (len(n.images.labels), len(n.points.labels), len(n.observations[0])) == (11, 7862, 37123)
     camera = n.cameras[0]
     assert camera.model.name == "SIMPLE_RADIAL" and camera.values.tolist() == [2971.71, 1416.0, 1064.0, -0.164224]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from baarda.cli.base import Control, FormatName, app, guarded
+from baarda.cli.base import Control, Crs, FormatName, GeoidHeight, MarksFile, app, guarded
 
 
 @app.command()
@@ -18,12 +18,15 @@ def convert(
     out: Annotated[Path, typer.Option("--out", help="File or folder to write; must not exist.")],
     format: FormatName = None,
     control: Control = None,
+    marks: MarksFile = None,
+    crs: Crs = None,
+    geoid: GeoidHeight = None,
 ) -> None:
     """Read one format, write another."""
     from baarda.errors import OutputError
     from baarda.formats import read, write
 
-    network = read(source, format=format, control=control)
+    network = read(source, format=format, control=control, marks=marks, crs=crs, geoid=geoid)
     if out.exists():
         raise OutputError(f"{out} exists")
     write(network, out, to)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from baarda.discover import members
 from baarda.errors import InputError, UsageError
-from baarda.formats.base import Format, regular_size, unreadable
+from baarda.formats.base import FIRST_PIXEL, Format, regular_size, unreadable
 from baarda.network import Network
 
 __all__ = ["Format", "formats", "read", "recognise", "write"]
@@ -49,7 +49,14 @@ def _exists(path: Path) -> None:
         regular_size(path)
 
 
-def read(path: str | Path, format: str | None = None, control: str | Path | None = None) -> Network:
+def read(
+    path: str | Path,
+    format: str | None = None,
+    control: str | Path | None = None,
+    crs: str | None = None,
+    geoid: str | float | None = None,
+    marks: str | Path | None = None,
+) -> Network:
     """Read a network.
 
     Parameters
@@ -61,6 +68,13 @@ def read(path: str | Path, format: str | None = None, control: str | Path | None
     control : str or Path, optional
         A table of control and check points that replaces what the source says of them, see `baarda.formats.control`, or a list of
         control points with their image marks, see `baarda.formats.odm_gcp`.
+    crs : str, optional
+        The coordinate system of that table (extra ``geo``): an EPSG code such as ``EPSG:25832``, WKT or a proj string. The block then
+        stands in a local frame (east, north, up), see `baarda.formats.coordinate_system`.
+    geoid : str or float, optional
+        Geoid height in metres, or the file of a grid, where heights of that system are above a vertical datum.
+    marks : str or Path, optional
+        A table of image marks of control and check points, see `baarda.formats.marks_table`.
 
     Returns
     -------
@@ -72,6 +86,8 @@ def read(path: str | Path, format: str | None = None, control: str | Path | None
         If a file cannot be used; the message names file and line.
     """
     where = Path(path)
+    if (geoid is not None and crs is None) or (crs is not None and control is None):
+        raise UsageError("a geoid belongs to a coordinate system (crs), and that to a table of control points")
     if format is None:
         chosen = recognise(where)
     elif format in formats():
@@ -83,12 +99,26 @@ def read(path: str | Path, format: str | None = None, control: str | Path | None
         network = chosen.read(where)
     except OSError as error:
         raise unreadable(error, where) from None
-    network = replace(network, path=str(path), format=chosen.name, sha256=digest(where))
+    settings = network.settings if chosen.first_pixel is None else {**network.settings, FIRST_PIXEL: chosen.first_pixel}
+    network = replace(network, path=str(path), format=chosen.name, sha256=digest(where), settings=settings)
+    if marks is not None:
+        from baarda.formats.marks_table import with_marks_table
+
+        network = with_marks_table(network, marks)
     if control is not None:
         from baarda.formats.control import with_control
         from baarda.formats.odm_gcp import is_gcp_list, with_gcp_list
 
-        network = (with_gcp_list if is_gcp_list(Path(control)) else with_control)(network, Path(control))
+        listed = is_gcp_list(Path(control))
+        if listed and crs is not None:
+            raise UsageError(f"{control} names its coordinate system in its first line: --crs belongs to tables")
+        if listed:
+            return with_gcp_list(network, Path(control))
+        if crs is None:
+            return with_control(network, Path(control))
+        from baarda.formats.coordinate_system import CoordinateSystem
+
+        return with_control(network, Path(control), CoordinateSystem.of(crs, geoid))
     return network
 
 

@@ -10,10 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from baarda.errors import InputError
+from baarda.errors import InputError, UsageError
 from baarda.network import Network
 
+FIRST_PIXEL = "first_pixel"  # key of the settings of a network, see Format
 LARGEST = 4 * 1024**3  # bytes of a text file that a reader accepts
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _CONTROL_BUT_TAB = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
@@ -68,6 +70,20 @@ def label_problem(label: str, what: str) -> str | None:
     return None if found is None else f"{what} {label!r} holds a control character ({found!r})"
 
 
+def first_pixel(network: Network) -> float | None:
+    """Return the coordinate of the centre of the first pixel in the source pixels of a network, None where its source does not say.
+
+    Raises
+    ------
+    UsageError
+        If a project states something else than 0 or 0.5.
+    """
+    value = network.settings.get(FIRST_PIXEL)
+    if value is None or (value in (0.0, 0.5) and not isinstance(value, bool)):
+        return None if value is None else float(value)
+    raise UsageError(f"{FIRST_PIXEL} must be 0 or 0.5, not {value!r}")
+
+
 def regular_size(path: Path) -> int:
     """Return the size of a file in bytes.
 
@@ -111,6 +127,37 @@ def unreadable(error: OSError, path: Path) -> InputError:
 
 
 @dataclass(frozen=True)
+class MeasuredPositions:
+    """Positions of cameras (of their antennas) that a source holds beside its solution.
+
+    Attributes
+    ----------
+    file : Path
+    images : tuple of str
+        Label of each image.
+    xyz : (n, 3) array
+        In the system of the network that the reader returns.
+    covariances : (n, 3, 3) array
+    strips : tuple of str
+    times : (n,) array or None
+        Seconds; None = the source has none.
+    complain : callable
+        Row and message to the error with file and line.
+    notes : tuple of str
+        Assumptions made.
+    """
+
+    file: Path
+    images: tuple[str, ...]
+    xyz: NDArray[np.float64]
+    covariances: NDArray[np.float64]
+    strips: tuple[str, ...]
+    times: NDArray[np.float64] | None
+    complain: Callable[[int, str], InputError]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Format:
     """A file format.
 
@@ -125,6 +172,10 @@ class Format:
         ``path -> Network``; `path` and `format` of the network are set by the caller.
     write : callable or None
         ``(network, path) -> None``.
+    positions : callable or None
+        ``path -> MeasuredPositions``: the measured camera positions of a source, for `--camera-positions source`.
+    first_pixel : float or None
+        Coordinate of the centre of the first pixel, 0.5 or 0, where the format states it; a network keeps it among its settings.
     """
 
     name: str
@@ -132,6 +183,8 @@ class Format:
     recognises: Callable[[Path], bool]
     read: Callable[[Path], Network]
     write: Callable[[Network, Path], None] | None = None
+    positions: Callable[[Path], MeasuredPositions] | None = None
+    first_pixel: float | None = None
 
 
 @dataclass(frozen=True)

@@ -11,20 +11,26 @@ from numpy.typing import NDArray
 from baarda.cameras import FREE
 from baarda.errors import InputError, UsageError
 from baarda.formats import checks
-from baarda.formats.base import number
+from baarda.formats.base import MeasuredPositions, number
+from baarda.formats.control import MOVED
+from baarda.formats.coordinate_system import FRAME, SYSTEM, CoordinateSystem, checked, system_of
 from baarda.formats.csv_table import CsvTable, read_csv
 from baarda.formats.gcp_marks import some
 from baarda.formats.project_writer import CORRELATIONS
 from baarda.geometry.similarity import similarity
+from baarda.geometry.tangent_frame import TangentFrame
 from baarda.network import AXES, CONTROL, Network
 from baarda.observations.camera_positions import CameraPositions, lever_arms, strips
 
 Floats = NDArray[np.float64]
 
 MODELS = ("none", "shift", "drift")
+SOURCE = "source"  # in place of a table
 
 
-def with_camera_positions(network: Network, path: str | Path, lever_arm: str = "0,0,0", model: str = "none") -> Network:
+def with_camera_positions(
+    network: Network, path: str | Path, lever_arm: str = "0,0,0", model: str = "none", system: CoordinateSystem | None = None
+) -> Network:
     """Return the network with observed camera positions.
 
     Parameters
@@ -32,12 +38,15 @@ def with_camera_positions(network: Network, path: str | Path, lever_arm: str = "
     network : Network
     path : str or Path
         A CSV table with the columns image, X, Y, Z, sigma_X, sigma_Y, sigma_Z and, optional, correlation_XY, correlation_XZ,
-        correlation_YZ, strip, time (seconds): the position of the antenna in the system of the network's control.
+        correlation_YZ, strip, time (seconds): the position of the antenna in the system of the network's control; or ``source``: the
+        positions that the network's own source holds (OpenSfM, Metashape, OPF).
     lever_arm : str
         From the projection centre to the antenna in camera axes (x right, y up, z backwards): ``x,y,z`` known; ``free``, or
         ``free:x,y,z`` with a start value, estimated, one for each camera.
     model : {"none", "shift", "drift"}
         Whether a shift, or a shift and a drift, is estimated for each strip.
+    system : CoordinateSystem, optional
+        That of the table; the positions are led to the frame of the control points, of the network's source, or in their own middle.
 
     Returns
     -------
@@ -56,40 +65,39 @@ def with_camera_positions(network: Network, path: str | Path, lever_arm: str = "
         raise UsageError(f"the model of camera positions is one of {', '.join(MODELS)}, not {model!r}")
     if any(isinstance(g, CameraPositions) for g in network.observations):
         raise UsageError("the network has camera positions already")
-    path = Path(path)
-    table = read_csv(path, ("image", *AXES, *(f"sigma_{a}" for a in AXES)), (*CORRELATIONS, "strip", "time"))
-    labels = list(table.labels("image", "image"))
+    found = _of_source(network) if str(path) == SOURCE else _of_table(Path(path))
+    if system is not None and str(path) != SOURCE:
+        network, found = _led(network, found, system)
     index = {label: i for i, label in enumerate(network.images.labels)}
-    rows = np.array([i for i, label in enumerate(labels) if label in index], dtype=np.intp)
-    notes: list[str] = []
+    rows = np.array([i for i, label in enumerate(found.images) if label in index], dtype=np.intp)
+    notes: list[str] = list(found.notes)
     if not len(rows):
-        raise table.error(0, f"no image of the table is in the network, whose images are called {some(list(network.images.labels))}")
-    if len(rows) < len(labels):
-        absent = [label for label in labels if label not in index]
-        notes.append(f"{len(absent)} camera position(s) of {path.name} belong to no image and are left out: {some(absent)}")
-    xyz = np.stack([table.numbers(a, None) for a in AXES], axis=1)
-    covariances = _covariances(table)
-    lines = list(table.texts("strip", "all"))
-    times = table.numbers("time", 0.0)
-    if model == "drift" and "time" not in table.columns:
-        raise InputError("a drift needs the column time", path, 1)
-    images = np.array([index[labels[i]] for i in rows], dtype=np.intp)
-    strip_names = list(dict.fromkeys(lines[i] for i in rows))
-    line = np.array([strip_names.index(lines[i]) for i in rows], dtype=np.intp)
-    times = times[rows]
+        raise found.complain(0, f"no image of the table is in the network, whose images are called {some(list(network.images.labels))}")
+    if len(rows) < len(found.images):
+        absent = [label for label in found.images if label not in index]
+        notes.append(f"{len(absent)} camera position(s) of {found.file.name} belong to no image and are left out: {some(absent)}")
+    if model == "drift" and found.times is None:
+        raise InputError("a drift needs the column time", found.file, 1)
+    images = np.array([index[found.images[i]] for i in rows], dtype=np.intp)
+    strip_names = list(dict.fromkeys(found.strips[i] for i in rows))
+    line = np.array([strip_names.index(found.strips[i]) for i in rows], dtype=np.intp)
+    times = np.zeros(len(rows)) if found.times is None else found.times[rows]
     middle = np.bincount(line, times) / np.bincount(line)
     times = times - middle[line]
     if model == "drift":
         still = np.flatnonzero(np.bincount(line, np.abs(times)) == 0.0)
         if len(still):
-            raise table.error(int(rows[np.flatnonzero(line == still[0])[0]]), f"strip {strip_names[still[0]]!r} has no two times: no drift")
-    group = CameraPositions(images, network.images.cameras[images], line, times, xyz[rows], covariances[rows], unit=network.unit)
+            first = int(rows[np.flatnonzero(line == still[0])[0]])
+            raise found.complain(first, f"strip {strip_names[still[0]]!r} has no two times: no drift")
+    group = CameraPositions(
+        images, network.images.cameras[images], line, times, found.xyz[rows], found.covariances[rows], unit=network.unit
+    )
     cameras = [c.label for c in network.cameras]
     known = (network.points.roles == CONTROL).any() or (network.images.states != FREE).any()
     if not known:
-        network = _carried_over(network, group, path, notes)
+        network = _carried_over(network, group, found.file, notes)
     elif network.unit == checks.MODEL_UNITS:
-        raise InputError("positions cannot be joined with known values that are in model units", path)
+        raise InputError("positions cannot be joined with known values that are in model units", found.file)
     unit = network.unit
     group = replace(group, unit=unit)
     declared = (
@@ -107,6 +115,54 @@ def with_camera_positions(network: Network, path: str | Path, lever_arm: str = "
         declared=(*network.declared, *declared),
         assumptions=(*network.assumptions, *notes),
     )
+
+
+def _led(network: Network, found: MeasuredPositions, system: CoordinateSystem) -> tuple[Network, MeasuredPositions]:
+    """Return the positions in a local frame with their covariances, and the network with that frame among its settings."""
+    mine = system_of(network.settings)
+    if mine is not None and mine[0].name == system.name:
+        system = mine[0]  # with the geoid heights that came with the control points
+    lla = system.geographic(found.xyz)
+    checked(lla, found.xyz, system, found.complain)
+    known = network.settings.get(FRAME)
+    if known is not None and network.unit != checks.MODEL_UNITS:
+        frame = TangentFrame(*(float(v) for v in known)) if mine is None else mine[1]
+        if abs(frame.a - system.ellipsoid[0]) > 0.01:
+            raise UsageError(f"the network stands on another ellipsoid than {system.name:.60}: give both in systems of one datum")
+    else:
+        frame = system.frame(found.xyz)
+    local = frame.local(lla)
+    j = system.partials(local, frame)
+    turned = replace(found, xyz=local, covariances=j @ found.covariances @ j.transpose(0, 2, 1), notes=(*found.notes, system.text()))
+    settings = network.settings if SYSTEM in network.settings else {**network.settings, **system.settings(frame)}
+    return replace(network, settings=settings), turned
+
+
+def _of_source(network: Network) -> MeasuredPositions:
+    """Return the measured positions that the source of a network holds."""
+    from baarda.formats import formats
+
+    if network.settings.get(MOVED):
+        raise UsageError("the block was carried over to its control points, and the positions of its source were not: give them as a table")
+    known = formats()
+    if network.format not in known or not network.path:
+        raise UsageError("the network was not read from a file: give its measured camera positions as a table")
+    positions = known[network.format].positions
+    if positions is None:
+        able = ", ".join(f.name for f in known.values() if f.positions is not None)
+        raise UsageError(
+            f"a source of format {network.format} holds no measured camera positions that are read; those of {able} are: give a table"
+        )
+    return positions(Path(network.path))
+
+
+def _of_table(path: Path) -> MeasuredPositions:
+    """Return the positions of a CSV table."""
+    table = read_csv(path, ("image", *AXES, *(f"sigma_{a}" for a in AXES)), (*CORRELATIONS, "strip", "time"))
+    labels = table.labels("image", "image")
+    xyz = np.stack([table.numbers(a, None) for a in AXES], axis=1)
+    times = table.numbers("time", 0.0) if "time" in table.columns else None
+    return MeasuredPositions(path, tuple(labels), xyz, _covariances(table), tuple(table.texts("strip", "all")), times, table.error)
 
 
 def _arm(text: str) -> tuple[bool, Floats]:

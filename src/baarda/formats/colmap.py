@@ -364,4 +364,4 @@ def _camera(camera: ModelCamera) -> Camera:
     )
 
 
-colmap = Format("colmap", "COLMAP model, text or binary, with or without rigs and frames", recognises, read, write)
+colmap = Format("colmap", "COLMAP model, text or binary, with or without rigs and frames", recognises, read, write, first_pixel=0.5)

@@ -6,9 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from baarda.cameras import Camera
 from baarda.errors import UsageError
+from baarda.formats.base import first_pixel
 from baarda.formats.colmap_model import CAMERA_MODELS
 from baarda.formats.folder import write_folder
+from baarda.formats.opencv_form import ORDER, as_opencv, plain_pixels
 from baarda.network import Network
 from baarda.observations import ImagePoints
 
@@ -19,7 +22,9 @@ def write(network: Network, path: Path) -> None:
     Parameters
     ----------
     network : Network
-        Cameras of COLMAP's models, all images oriented, all measured points with coordinates; points without image points are left out.
+        Cameras of COLMAP's models, or of OpenCV's, Pix4D's and Metashape's that FULL_OPENCV contains, all images oriented, all measured
+        points with coordinates; points without image points are left out. Pixels whose first one has its centre at (0, 0) move by half
+        a pixel to COLMAP's.
     path : Path
         The folder; it must not exist yet, or be empty.
 
@@ -41,6 +46,12 @@ def _ids(labels: list[str]) -> list[int]:
     return list(range(1, len(labels) + 1))
 
 
+def _shift(network: Network) -> float:
+    """Return what leads from the pixels of a network to COLMAP's, whose first one has its centre at 0.5."""
+    first = first_pixel(network)
+    return 0.0 if first is None else 0.5 - first
+
+
 def _cameras(network: Network) -> list[str]:
     lines = [
         "# Camera list with one line of data per camera:",
@@ -48,14 +59,27 @@ def _cameras(network: Network) -> list[str]:
         f"# Number of cameras: {len(network.cameras)}",
     ]
     for number, c in zip(_ids([c.label for c in network.cameras]), network.cameras, strict=True):
-        if c.model.name not in CAMERA_MODELS.values():
-            raise UsageError(f"camera {c.label}: COLMAP has no model {c.model.name!r}")
-        plain = c.unit == "px" and c.y_down and (np.asarray(c.pixel_size) == 1.0).all() and (np.asarray(c.origin) == 0.0).all()
-        if not plain or c.image_size is None or not all(float(s).is_integer() for s in c.image_size):
+        name, parameters = _parameters(c, _shift(network))
+        if not plain_pixels(c) or c.image_size is None or not all(float(s).is_integer() for s in c.image_size):
             raise UsageError(f"camera {c.label}: COLMAP needs pixels from the upper left corner, y down, and the image size")
-        values = " ".join(repr(v) for v in np.asarray(c.values, dtype=float).tolist())
-        lines.append(f"{number} {c.model.name} {int(c.image_size[0])} {int(c.image_size[1])} {values}")
+        values = " ".join(repr(v) for v in parameters)
+        lines.append(f"{number} {name} {int(c.image_size[0])} {int(c.image_size[1])} {values}")
     return lines
+
+
+def _parameters(camera: Camera, shift: float) -> tuple[str, list[float]]:
+    """Return COLMAP's model and parameters; what is in OpenCV's terms becomes FULL_OPENCV."""
+    if camera.model.name in CAMERA_MODELS.values():
+        point = np.array([n.startswith("principal_point") for n in camera.model.order])
+        return camera.model.name, (np.asarray(camera.values, dtype=float) + shift * point).tolist()
+    found = as_opencv(camera)
+    if found is None:
+        raise UsageError(f"camera {camera.label}: COLMAP has no model {camera.model.name!r}")
+    found["cx"] += shift
+    found["cy"] += shift
+    if camera.model.name == "pinhole":
+        return "SIMPLE_PINHOLE", [found["fx"], found["cx"], found["cy"]]
+    return "FULL_OPENCV", [found[n] for n in ORDER]
 
 
 def _images_and_points(network: Network) -> dict[str, list[str]]:
@@ -73,7 +97,7 @@ def _images_and_points(network: Network) -> dict[str, list[str]]:
         raise UsageError("a COLMAP model holds image points only, and there must be some")
     image, point, xy = (np.concatenate([getattr(g, a) for g in groups]) for a in ("images", "points", "xy"))
     order = np.argsort(image, kind="stable")
-    image, point, xy = image[order], point[order], xy[order]
+    image, point, xy = image[order], point[order], xy[order] + _shift(network)
     unknown = np.flatnonzero(~np.isfinite(points.coordinates).all(axis=1) & (np.bincount(point, minlength=len(points.labels)) > 0))
     if len(unknown):
         raise UsageError(f"point {points.labels[unknown[0]]} has no coordinates")

@@ -280,10 +280,21 @@ def _exterior_flags(operations: ElementTree.Element | None, path: Path) -> None:
             raise InputError(f"<set_bundle_estimate_params><{tag}> {values} is not supported; supported: {', '.join(allowed)}", path)
 
 
-def _files(element: ElementTree.Element | None, base: Path) -> list[tuple[ElementTree.Element, Path]]:
+def _files(element: ElementTree.Element | None, base: Path, path: Path) -> list[tuple[ElementTree.Element, Path]]:
     if element is None:
         return []
-    return [(f, base / (f.text or "").strip().replace("\\", "/")) for f in element.findall("file")]
+    return [(f, _inside(base / (f.text or "").strip().replace("\\", "/"), path)) for f in element.findall("file")]
+
+
+def _inside(file: Path, path: Path) -> Path:
+    """Return the place of a table; a script from a stranger names none outside the folder that it lies in."""
+    try:
+        inside = file.resolve().is_relative_to(path.resolve().parent)
+    except (OSError, ValueError):  # a name that no file can have
+        inside = False
+    if not inside:
+        raise InputError(f"table {str(file)!r} lies outside the folder of the script", path)
+    return file
 
 
 def _columns(element: ElementTree.Element, path: Path, known: set[str], required: tuple[str, ...]) -> list[str]:
@@ -303,7 +314,7 @@ def _columns(element: ElementTree.Element, path: Path, known: set[str], required
 
 def _images(source: ElementTree.Element, base: Path, path: Path) -> tuple[Images, dict[str, Line]]:
     labels, lines = [], []
-    for element, file in _files(_find(source, "images", path), base):
+    for element, file in _files(_find(source, "images", path), base, path):
         columns = _columns(element, path, {"id", "path", "label", "ignored"}, ("id", "path"))
         for line in read_lines(file):
             labels.append(line.text_at(columns.index("id"), "image id"))
@@ -318,7 +329,7 @@ def _coordinates(element: ElementTree.Element | None, base: Path, path: Path) ->
     """Read control or check points, filters applied."""
     out = []
     names = {"id", "label", "x", "y", "z", "sx", "sy", "sz", "sxy", "sxyz", "ignored"}
-    for node, file in _files(element, base):
+    for node, file in _files(element, base, path):
         columns = _columns(node, path, names, ("id", "x", "y", "z"))
         for line in read_lines(file):
             if len(line.fields) != len(columns):
@@ -353,7 +364,7 @@ def _image_points(
     points: dict[str, int] = {}
     rows: list[tuple[int, int, float, float, float, float]] = []
     first: dict[tuple[int, int], Line] = {}
-    for element, file in _files(_find(source, "image_pts", path), base):
+    for element, file in _files(_find(source, "image_pts", path), base, path):
         columns = _columns(element, path, {"id", "im", "x", "y", "sx", "sy", "sxy", "ignored"}, ("id", "im", "x", "y"))
         default = _numbers(element.get("sxy"), "sxy", path, 1)[0] if element.get("sxy") else None
         at = {c: i for i, c in enumerate(columns)}

@@ -20,13 +20,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
 GROUP = "control marks"
-#: formats whose pixels count from the corner of the first one, so that its centre lies at (0.5, 0.5)
-FROM_CORNER = ("colmap", "metashape")
-
-
-def first_pixel(network: Network) -> float:
-    """Return the coordinate of the centre of the first pixel in the source pixels of a network, 0.5 or 0."""
-    return 0.5 if network.format in FROM_CORNER else 0.0
+PREFIX = "GCP "  # of a control point whose label another point bears
 
 
 @dataclass(frozen=True)
@@ -101,7 +95,7 @@ def with_marks(
     position = np.full(len(marks.labels), -1)
     position[use] = np.arange(len(use))
     taken = set(network.points.labels)
-    labels = [f"GCP {marks.labels[i]}" if marks.labels[i] in taken else marks.labels[i] for i in use]
+    labels = [f"{PREFIX}{marks.labels[i]}" if marks.labels[i] in taken else marks.labels[i] for i in use]
     twice = next((name for name in labels if name in taken), None)
     if twice is not None or len(set(labels)) < len(labels):
         raise InputError(f"control point {twice or next(n for n in labels if labels.count(n) > 1)!r} is there twice", marks.file)

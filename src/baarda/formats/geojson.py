@@ -9,11 +9,13 @@ from typing import Any, Literal
 import numpy as np
 
 from baarda.errors import UsageError
+from baarda.formats.coordinate_system import system_of
 from baarda.formats.csv_table import csv_text, numbers_text, quoted
 from baarda.formats.whole_file import write_file
 from baarda.geometry.tangent_frame import TangentFrame
 from baarda.network import AXES
 
+_PAIRS, _INDICES = ("XY", "XZ", "YZ"), ((0, 1), (0, 2), (1, 2))
 _DEGREES, _METRES = 11, 5  # decimals of GeoJSON: micrometres at the equator
 
 
@@ -24,7 +26,8 @@ def write_points(result: Any, path: str | Path, sigma: Literal["aposteriori", "a
     ----------
     result : Adjustment
     path : str or Path
-        A new file: ``.csv``, or ``.geojson`` for networks in the frame (east, north, up) of a place that their source names.
+        A new file: ``.csv``, in the coordinate system of the control points where one was given, else in that of the network; or
+        ``.geojson`` for networks in the frame (east, north, up) of a place that their source names.
     sigma : {"aposteriori", "apriori"}
         Which variance factor scales the cofactors.
 
@@ -44,6 +47,7 @@ def write_points(result: Any, path: str | Path, sigma: Literal["aposteriori", "a
     names = ("point", "role", *AXES, "sX", "sY", "sZ", "corr_XY", "corr_XZ", "corr_YZ", "rays")
     columns = {n: np.asarray(table[n]) for n in names}
     if path.suffix.lower() == ".csv":
+        columns = _in_their_system(result, columns)
         text = {n: numbers_text(c) if c.dtype.kind == "f" else [quoted(str(v)) for v in c.tolist()] for n, c in columns.items()}
         write_file(path, csv_text(text).encode("utf-8"))
         return
@@ -52,13 +56,38 @@ def write_points(result: Any, path: str | Path, sigma: Literal["aposteriori", "a
     write_file(path, _geojson(result, columns, sigma).encode("utf-8"))
 
 
+def _in_their_system(result: Any, columns: dict[str, Any]) -> dict[str, Any]:
+    """Return the columns in the coordinate system of the control points, covariances turned back; unchanged where none was given."""
+    named = system_of(result.network.settings)
+    if named is None:
+        return columns
+    system, frame = named
+    local = np.stack([columns[a] for a in AXES], axis=1) - np.asarray(result.network.offset)
+    xyz = system.from_local(local, frame)
+    s = np.stack([columns[n] for n in ("sX", "sY", "sZ")], axis=1)
+    r = np.nan_to_num(np.stack([columns[f"corr_{p}"] for p in _PAIRS], axis=1))  # a coordinate that was held fixed has none
+    c = np.broadcast_to(np.eye(3), (len(s), 3, 3)).copy()
+    for j, (a, b) in enumerate(_INDICES):
+        c[:, a, b] = c[:, b, a] = r[:, j]
+    back = np.linalg.inv(system.partials(local, frame))
+    c = back @ (c * s[:, :, None] * s[:, None, :]) @ back.transpose(0, 2, 1)
+    s = np.sqrt(np.einsum("nii->ni", c))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        turned = {f"corr_{p}": c[:, a, b] / (s[:, a] * s[:, b]) for p, (a, b) in zip(_PAIRS, _INDICES, strict=True)}
+    out = {**columns, **dict(zip((*AXES, "sX", "sY", "sZ"), np.hstack([xyz, s]).T, strict=True)), **turned}
+    return {**out, "system": np.full(len(s), system.name)}
+
+
 def _geojson(result: Any, columns: dict[str, Any], sigma: str) -> str:
     reference = result.network.settings.get("reference_lla")
     if reference is None or result.network.unit != "m":
         raise UsageError("GeoJSON needs longitude and latitude, and the source does not say where on the earth the points are: write .csv")
-    frame = TangentFrame(*(float(v) for v in reference))
+    named = system_of(result.network.settings)
+    frame = TangentFrame(*(float(v) for v in reference)) if named is None else named[1]
     xyz = np.stack([columns[a] for a in AXES], axis=1) - np.asarray(result.network.offset)
     lla = frame.geographic(xyz)
+    if named is not None:
+        lla = named[0].to_wgs84(lla)
     features = []
     for i, place in enumerate(lla.tolist()):
         properties: dict[str, Any] = {"point": str(columns["point"][i]), "role": str(columns["role"][i]), "rays": int(columns["rays"][i])}

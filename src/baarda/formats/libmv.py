@@ -63,9 +63,10 @@ def read(path: Path) -> Network:
     if len(data) < _HEAD or data[:1] not in _ORDERS or data[1:2] not in _SPACES:
         raise InputError("not a libmv problem: it must begin with v or V, then P or N, then eight numbers", path)
     order = _ORDERS[data[:1]]
-    values = np.frombuffer(data, order + "f4", len(_PARAMETERS), 2).astype(float)
-    if not (np.isfinite(values).all() and values[0] > 0.0):
-        raise InputError(f"byte 2: the camera parameters must be finite and the focal length positive: {values.tolist()}", path)
+    given = np.frombuffer(data, order + "f4", len(_PARAMETERS), 2)
+    if not (np.isfinite(given).all() and given[0] > 0.0):
+        raise InputError(f"byte 2: the camera parameters must be finite and the focal length positive: {given.tolist()}", path)
+    values = given.astype(float)
     i4, f4 = order + "i4", order + "f4"
     cameras, at = _table(data, _HEAD, [("id", i4), ("R", f4, (9,)), ("t", f4, (3,))], "cameras", order, path)
     begin = at
@@ -115,7 +116,7 @@ def _table(data: bytes, at: int, fields: list[Any], what: str, order: str, path:
         raise InputError(f"byte {at}: {count} {what} are announced, the file ends before them: truncated?", path)
     records = np.frombuffer(data, dtype, count, at + 4)
     for name in dtype.names or ():
-        bad = np.flatnonzero(~np.isfinite(records[name].reshape(count, -1).astype(float)).all(axis=1))
+        bad = np.flatnonzero(~np.isfinite(records[name].reshape(count, -1)).all(axis=1))
         if len(bad):
             raise InputError(f"byte {at + 4 + int(bad[0]) * dtype.itemsize}: {what}: a number is not finite", path)
     if "id" in (dtype.names or ()):

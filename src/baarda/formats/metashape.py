@@ -19,7 +19,7 @@ from baarda import cameras as camera_models
 from baarda.cameras import Camera
 from baarda.errors import InputError
 from baarda.formats import checks
-from baarda.formats.base import Format
+from baarda.formats.base import Format, MeasuredPositions
 from baarda.formats.gcp_marks import Marks, put_on_control, with_marks
 from baarda.formats.geographic import latitude_longitude
 from baarda.formats.metashape_document import Chunk, looks_like, opened
@@ -35,6 +35,7 @@ Ints = NDArray[np.intp]
 AXES = np.diag([1.0, -1.0, -1.0])  # Metashape's camera axes in ours
 #: Metashape's accuracies where the chunk does not say them: pixels, pixels, metres
 _USUAL = {"accuracy_tiepoints": 1.0, "accuracy_projections": 0.5, "accuracy_markers": 0.005}
+_CAMERAS = ("accuracy_cameras", 10.0)  # metres
 _NAMES = {
     "principal_distance": "f", "principal_point_x": "cx", "principal_point_y": "cy", "K1": "k1", "K2": "k2", "K3": "k3", "K4": "k4",
     "P1": "p1", "P2": "p2", "B1": "b1", "B2": "b2",
@@ -63,6 +64,18 @@ def read(path: Path) -> Network:
     """
     with opened(path) as chunk:
         return _Reader(chunk).network()
+
+
+def positions(path: Path) -> MeasuredPositions:
+    """Return the measured positions of the enabled cameras, in the system of the network.
+
+    Raises
+    ------
+    InputError
+        With file and line, if there are none or one cannot be used.
+    """
+    with opened(path) as chunk:
+        return _Reader(chunk).positions()
 
 
 @dataclass
@@ -150,7 +163,7 @@ class _Reader:
         if world is None and marks is not None:
             network = put_on_control(network, self.source.file, self.notes)
         if any(e.first("reference") is not None for e in elements):
-            self.notes.append("measured camera positions are not used: give them with their sigmas by --camera-positions")
+            self.notes.append("measured camera positions are not used: --camera-positions source uses them, a table gives others")
         return replace(network, assumptions=(*network.assumptions, *self.notes))
 
     # ---- cameras and images ----
@@ -267,19 +280,46 @@ class _Reader:
         latitude = np.arctan2(xyz[2], horizontal * (1.0 - 0.00669437999014))
         return np.array([np.degrees(latitude), np.degrees(np.arctan2(xyz[1], xyz[0])), 0.0])
 
-    def _reference(self, marker: Element) -> tuple[Floats, Floats, bool]:
-        """Return coordinates, standard deviations and whether a marker takes part."""
+    def positions(self) -> MeasuredPositions:
+        """Return the measured positions of cameras; see `positions`."""
+        self.notes.clear()
+        usual = self._property(self.chunk.first("settings"), *_CAMERAS)
+        cameras = (*self.chunk.all("cameras", "camera"), *self.chunk.all("cameras", "group", "camera"))
+        found = [(c, *self._reference(c, usual, "camera")) for c in cameras if c.flag("enabled", True) and c.attributes.get("label")]
+        found = [f for f in found if f[3] and np.isfinite(f[1]).all()]
+        if not found:
+            raise self.chunk.error("no camera has a measured position that is enabled")
+        xyz, sigmas = np.array([f[1] for f in found]), np.array([f[2] for f in found])
+        markers = self.chunk.all("markers", "marker") + self.chunk.all("markers", "group", "marker")
+        world = self._world(markers)
+        crs = self.chunk.first("reference")
+        if crs is not None and crs.text and not crs.text.upper().startswith("LOCAL_CS"):
+            frame = None if world is None else world.frame
+            if frame is None:  # as the markers found it
+                known = np.array([self._reference(m)[0] for m in markers]).reshape(-1, 3)
+                known = known[np.isfinite(known).all(axis=1)]
+                frame = TangentFrame(*latitude_longitude(known if len(known) else xyz, crs.text, self.source.file).mean(axis=0))
+            xyz = frame.local(latitude_longitude(xyz, crs.text, self.source.file))
+        covariances = np.einsum("ni,ij->nij", sigmas**2, np.eye(3))
+        notes = [n for n in self.notes if n.startswith(_CAMERAS[0])]
+        labels = tuple(f[0].word("label") for f in found)
+        return MeasuredPositions(
+            self.source.file, labels, xyz, covariances, ("all",) * len(labels), None, lambda i, m: found[i][0].error(m), tuple(notes)
+        )
+
+    def _reference(self, marker: Element, usual: float | None = None, what: str = "marker") -> tuple[Floats, Floats, bool]:
+        """Return coordinates, standard deviations and whether a marker or camera takes part."""
         r = marker.first("reference")
         if r is None:
             return np.full(3, np.nan), np.full(3, np.nan), False
         xyz = np.array([r.value(a, np.nan) for a in "xyz"])
-        usual = self.accuracy["accuracy_markers"]
+        usual = self.accuracy["accuracy_markers"] if usual is None else usual
         whole = r.value("sxyz", usual)
         plan = r.value("sxy", whole)
         sigma = np.array([r.value("sx", plan), r.value("sy", plan), r.value("sz", whole)])
-        checks.sigma_range(sigma, "the accuracy of a marker", lambda _, m: r.error(m))
+        checks.sigma_range(sigma, f"the accuracy of a {what}", lambda _, m: r.error(m))
         if not (sigma > 0.0).all():
-            raise r.error("the accuracy of a marker must be positive")
+            raise r.error(f"the accuracy of a {what} must be positive")
         return xyz, sigma, r.flag("enabled", True)
 
     # ---- image points ----
@@ -370,4 +410,6 @@ class _Reader:
         return Marks(self.source.file, tuple(labels), given, points, images, np.array(xy)), roles, sigmas
 
 
-metashape = Format("metashape", "Agisoft Metashape: .psx, .psz, or XML of cameras and markers", looks_like, read)
+metashape = Format(
+    "metashape", "Agisoft Metashape: .psx, .psz, or XML of cameras and markers", looks_like, read, positions=positions, first_pixel=0.5
+)

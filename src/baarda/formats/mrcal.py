@@ -10,8 +10,11 @@ from __future__ import annotations
 
 import base64
 import io
+import lzma
 import math
 import re
+import tokenize
+import warnings
 import zipfile
 import zlib
 from pathlib import Path
@@ -32,6 +35,11 @@ from baarda.observations import ImagePoints
 Floats = NDArray[np.float64]
 
 LARGEST = 512 * 1024**2  # bytes of a model, and of its arrays
+#: what damaged archives and headers end in
+HEADER_ERRORS = (
+    *(ValueError, TypeError, KeyError, OSError, EOFError, RuntimeError, NotImplementedError, OverflowError, SyntaxError, MemoryError),
+    *(zlib.error, lzma.LZMAError, zipfile.BadZipFile, tokenize.TokenError),
+)
 _AXES = np.diag([1.0, -1.0, -1.0])  # mrcal's camera axes in ours
 _INPUTS = re.compile(r"'optimization_inputs'\s*:\s*b'([0-9A-Za-z!#$%&()*+;<=>?@^_`{|}~-]*)'")
 _LENS = re.compile(rb"'lens_?model'\s*:\s*'LENSMODEL_")
@@ -109,11 +117,13 @@ class _Inputs:
             stream = io.BytesIO(data)
             version = np.lib.format.read_magic(stream)
             header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, fortran, dtype = header(stream)
-        except (ValueError, OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError, NotImplementedError) as error:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of headers that Python 2 wrote
+                shape, fortran, dtype = header(stream)
+        except HEADER_ERRORS as error:
             raise self.error(f"{name} cannot be read: {error}") from None
         rest = len(data) - stream.tell()
-        if dtype.hasobject or fortran or math.prod(shape) * dtype.itemsize != rest:
+        if dtype.hasobject or fortran or any(type(s) is not int or s < 0 for s in shape) or math.prod(shape) * dtype.itemsize != rest:
             raise self.error(f"{name} is not a plain array of the size it announces")
         return np.frombuffer(data, dtype, math.prod(shape), stream.tell()).reshape(shape)
 
@@ -163,7 +173,8 @@ class _Inputs:
         weight = seen[..., 2].reshape(count, -1).astype(float)
         image, point = np.nonzero(weight > 0.0)
         xy = seen[..., :2].reshape(count, -1, 2)[image, point].astype(float)
-        sigma = 1.0 / weight[image, point]
+        with np.errstate(over="ignore"):  # weights next to zero are refused below
+            sigma = 1.0 / weight[image, point]
         checks.sigma_range(sigma, "1 / weight", lambda _, m: self.error(m))
         labels = [f"frame {f} camera {c}" for f, c, _ in index.tolist()]
         if len(set(labels)) < count:
@@ -220,4 +231,4 @@ def _board(height: int, width: int, spacing: float, warp: Floats) -> Floats:
     return np.stack([column * spacing, row * spacing, z], axis=1)
 
 
-mrcal = Format("mrcal", "mrcal camera model with the inputs of its calibration (.cameramodel)", recognises, read)
+mrcal = Format("mrcal", "mrcal camera model with the inputs of its calibration (.cameramodel)", recognises, read, first_pixel=0.0)

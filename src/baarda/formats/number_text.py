@@ -9,6 +9,7 @@ import warnings
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,9 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
 _BZIP2, _GZIP = b"BZh", b"\x1f\x8b"
+LARGEST_RATIO = 20  # unpacked bytes per packed byte; numbers as text pack by 2 to 6
+LARGEST_NUMBER = 1e15  # squares and sums of larger ones would overflow
+SMALL = 1 << 20  # bytes that may be packed more densely
 _PEEK = 1 << 21  # packed bytes that give the first text: more than one block of bzip2
 
 
@@ -29,23 +33,32 @@ def unpacked(path: Path) -> bytes:
     Raises
     ------
     InputError
-        If it cannot be read, is damaged, empty, or larger than a reader accepts, also after unpacking.
+        If it cannot be read, is damaged, empty, or larger than a reader accepts, also after unpacking (20 fold at most).
     """
     data = read_bytes(path)
     try:
         if data.startswith(_BZIP2):
             with bz2.open(io.BytesIO(data)) as packed:
-                data = packed.read(LARGEST + 1)
+                data = _up_to(cast(BinaryIO, packed), min(LARGEST, max(SMALL, LARGEST_RATIO * len(data))), path)
         elif data.startswith(_GZIP):
             with gzip.open(io.BytesIO(data)) as packed:
-                data = packed.read(LARGEST + 1)
+                data = _up_to(cast(BinaryIO, packed), min(LARGEST, max(SMALL, LARGEST_RATIO * len(data))), path)
     except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"the packed file is damaged: {error}", path) from None
-    if len(data) > LARGEST:
-        raise InputError(f"the unpacked text has more than {LARGEST} bytes", path)
     if not data.strip():
         raise InputError("the file is empty", path)
     return data
+
+
+def _up_to(packed: BinaryIO, limit: int, path: Path) -> bytes:
+    """Read a packed text piece by piece: one large read would ask for the limit at once."""
+    pieces, total = [], 0
+    while piece := packed.read(_PEEK):
+        pieces.append(piece)
+        total += len(piece)
+        if total > limit:
+            raise InputError(f"the unpacked text has more than {limit} bytes", path)
+    return b"".join(pieces)
 
 
 def beginning(path: Path, size: int = 4096) -> bytes:
@@ -89,7 +102,7 @@ class NumberText:
         Raises
         ------
         InputError
-            With the line of the first word that is not a finite number.
+            With the line of the first word that is not a number, not finite, or beyond 1e15.
 
         Examples
         --------
@@ -101,7 +114,7 @@ class NumberText:
             warnings.simplefilter("error", DeprecationWarning)
             try:
                 values = np.fromstring(text, sep=" ")
-                good = bool(np.isfinite(values).all())
+                good = bool((np.abs(values) <= LARGEST_NUMBER).all())
             except (DeprecationWarning, ValueError):
                 good = False
         if not good:
@@ -147,9 +160,10 @@ def _complain(file: Path, text: bytes, skipped: int) -> None:
     for i, line in enumerate(text.split(b"\n"), start=1):
         for word in line.split():
             try:
-                finite = np.isfinite(number(word.decode("ascii", "replace")))
+                value = abs(number(word.decode("ascii", "replace")))
             except ValueError:
                 raise InputError(f"not a number: {word[:40].decode('ascii', 'replace')!r}", file, i + skipped) from None
-            if not finite:
-                raise InputError(f"not finite: {word[:40].decode('ascii', 'replace')!r}", file, i + skipped)
+            if not value <= LARGEST_NUMBER:
+                why = f"beyond {LARGEST_NUMBER:g}" if np.isfinite(value) else "not finite"
+                raise InputError(f"{why}: {word[:40].decode('ascii', 'replace')!r}", file, i + skipped)
     raise InputError("the text cannot be parsed as numbers", file)

@@ -25,6 +25,7 @@ from baarda.observations import ImagePoints
 _AXES = np.diag([1.0, -1.0, -1.0])  # VisualSFM's camera axes in ours
 _CAMERA = re.compile(r'\s*(?:"(?P<quoted>[^"]*)"|(?P<plain>\S+))\s+(?P<rest>.*)')
 _LARGEST = 1e9  # of f and r
+_SMALLEST = 1e-6  # of a principal distance in pixels: its square must not vanish
 
 
 def recognises(path: Path) -> bool:
@@ -78,7 +79,7 @@ def read(path: Path) -> Network:
         if rest.text_at(0, "file name") in labels:
             raise line.error(f"image {name!r} appears twice (first in line {labels[name].number})")
         values = [rest.number_at(k, "a number of the camera") for k in range(1, 10)]
-        if not 0.0 < values[0] < _LARGEST or not abs(values[8]) < _LARGEST or max(map(abs, values)) > 1e12:
+        if not _SMALLEST < values[0] < _LARGEST or not abs(values[8]) < _LARGEST or max(map(abs, values)) > 1e12:
             raise line.error("the principal distance must be positive, and no number beyond all cameras")
         norm = float(np.linalg.norm(values[1:5]))
         if not abs(norm - 1.0) < 1e-3:

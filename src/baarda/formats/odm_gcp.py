@@ -8,17 +8,17 @@ x y z, pixel x, pixel y, image, and in OpenDroneMap's lists the name of the poin
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from baarda.errors import InputError
 from baarda.formats import checks
-from baarda.formats.base import Line, split_lines
-from baarda.formats.gcp_marks import Marks, first_pixel, put_on_control, some, with_marks
+from baarda.formats.base import Line, first_pixel, split_lines
+from baarda.formats.gcp_marks import Marks, put_on_control, some, with_marks
 from baarda.formats.geographic import latitude_longitude
 from baarda.geometry.tangent_frame import TangentFrame
 from baarda.network import Network
@@ -71,7 +71,7 @@ class GcpList:
         MissingExtra
             If the coordinates are in a projection and pyproj is not there.
         """
-        index = _images(network)
+        index = image_finder(network)
         found = np.array([index(name) for name in self.images], dtype=np.intp)
         if (found < 0).all():
             raise self.lines[0].error(
@@ -89,7 +89,7 @@ class GcpList:
                 )
         xy = self.xy[keep]
         if first_pixel(network):
-            xy = xy + first_pixel(network)
+            xy = xy + 0.5
             notes.append(f"0.5 px was added to the marks of {self.file.name}: the network counts pixels from the corner of the first one")
         points = self.points[keep]
         checks.measured_once(
@@ -183,7 +183,7 @@ def _height(line: Line) -> float:
     return line.number_at(2, "z")
 
 
-def _images(network: Network) -> Any:
+def image_finder(network: Network) -> Callable[[str], int]:
     """Return the function from a name in the list to an image, -1 for none: by label, else by the file name where only one fits."""
     exact = {label: i for i, label in enumerate(network.images.labels)}
     loose: dict[str, int] = {}

@@ -19,7 +19,7 @@ from baarda import cameras as camera_models
 from baarda.cameras import Camera
 from baarda.errors import InputError, MissingExtra
 from baarda.formats import checks
-from baarda.formats.base import Format, finite_or_nan, label_problem, number, split_lines
+from baarda.formats.base import Format, MeasuredPositions, finite_or_nan, label_problem, number, split_lines
 from baarda.formats.gcp_marks import Marks, with_marks
 from baarda.formats.json_tree import Json, read_json
 from baarda.formats.odm_gcp import read_gcp_list
@@ -36,6 +36,7 @@ REFERENCE = "reference_lla"  # key of the settings of a network: latitude, longi
 _PLACES = ("", "opensfm")  # an ODM project keeps the data set in a folder of that name
 _VERSION = "OPENSFM_TRACKS_VERSION_v"
 _WIDTHS = {0: 8, 1: 9, 2: 11}  # columns of tracks.csv by version
+_GPS_SIGMA = 15.0  # metres: OpenSfM's gps_dop where an image has none
 _PAIR = ("focal_x", "focal_y", "c_x", "c_y")
 #: projection type: our model, OpenSfM's keys in the order of its parameters, coefficients that are estimated
 _TYPES: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
@@ -125,10 +126,13 @@ def read(path: Path) -> Network:
     xy = normalised * size.max(axis=1, keepdims=True) + 0.5 * (size - 1.0)
     checks.images_with_points(image, labels, np.ones(len(labels), dtype=bool), lambda i, m: model.need("shots").at(labels[i]).error(m))
     position = -np.einsum("nji,nj->ni", rotation, translation)
-    reference = model.get("reference_lla")
+    reference = model.get(REFERENCE)
+    beside = files[0].parent / "reference_lla.json"  # where older versions keep it
+    if reference is None and beside.is_file():
+        reference = read_json(beside)
     origin = None if reference is None else tuple(reference.need(k).number() for k in ("latitude", "longitude", "altitude"))
     if any(s.get("gps_position") is not None for _, s in model.need("shots").entries()):
-        notes.append("GPS positions of the shots are not used: give them with their sigmas by --camera-positions")
+        notes.append("GPS positions of the shots are not used: --camera-positions source uses them, a table gives others")
     network = Network(
         tuple(used),
         Images.make(labels, owner, position, AXES @ rotation),
@@ -139,6 +143,57 @@ def read(path: Path) -> Network:
         assumptions=tuple(notes),
     )
     return _with_control(network, files[0].parent, origin, config)
+
+
+def positions(path: Path) -> MeasuredPositions:
+    """Return the GPS positions of the shots of the largest reconstruction.
+
+    Notes
+    -----
+    Their standard deviation is ``gps_dop`` in all three axes, as OpenSfM weights them; strips are not told apart, times are capture times.
+
+    Raises
+    ------
+    InputError
+        With file and line, if there are none or one cannot be used.
+    """
+    files = _files(path)
+    if files is None:
+        raise InputError("not an OpenSfM data set: reconstruction.json or tracks.csv is missing", path)
+    model = _largest(read_json(files[0]), [])
+    labels, xyz, sigmas, times = [], [], [], []
+    shots = model.need("shots")
+    usual = 0
+    for key, shot in shots.entries():
+        place = shot.get("gps_position")
+        if place is None:
+            continue
+        dop = shot.get("gps_dop")
+        sigma = _GPS_SIGMA if dop is None else dop.number()
+        usual += dop is None
+        if not 0.0 < sigma < 1e6 or (dop is not None and sigma < checks.SIGMAS[0]):
+            raise (dop or shot).error("gps_dop must be a positive number of metres")
+        time = shot.get("capture_time")
+        labels.append(key)
+        xyz.append(place.numbers(3))
+        sigmas.append(sigma)
+        times.append(float("nan") if time is None else time.number())
+    if not labels:
+        raise shots.error("no shot has a gps_position")
+    notes = ["GPS positions have the standard deviation gps_dop of their shots in X, Y and Z, as OpenSfM takes it"]
+    if usual:
+        notes.append(f"{usual} shot(s) have no gps_dop: {_GPS_SIGMA:g} m, OpenSfM's usual value")
+    at = np.array(times)
+    return MeasuredPositions(
+        files[0],
+        tuple(labels),
+        np.array(xyz),
+        np.array(sigmas)[:, None, None] ** 2 * np.eye(3),
+        ("all",) * len(labels),
+        at if np.isfinite(at).all() else None,
+        lambda i, m: shots.at(labels[i]).error(m),
+        tuple(notes),
+    )
 
 
 def _largest(root: Json, notes: list[str]) -> Json:
@@ -330,4 +385,12 @@ def _json_control(root: Json, network: Network, frame: TangentFrame | None, note
     return Marks(root.file, tuple(labels), given, pairs[:, 0], pairs[:, 1], np.array(xy).reshape(-1, 2))
 
 
-opensfm = Format("opensfm", "OpenSfM or OpenDroneMap data set (reconstruction.json, tracks.csv, control points)", recognises, read, write)
+opensfm = Format(
+    "opensfm",
+    "OpenSfM or OpenDroneMap data set (reconstruction.json, tracks.csv, control points)",
+    recognises,
+    read,
+    write,
+    positions,
+    first_pixel=0.0,
+)

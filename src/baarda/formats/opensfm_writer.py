@@ -10,8 +10,9 @@ import numpy as np
 
 from baarda.cameras import FIXED, Camera
 from baarda.errors import UsageError
+from baarda.formats.base import first_pixel
 from baarda.formats.folder import write_folder
-from baarda.formats.gcp_marks import first_pixel
+from baarda.formats.opencv_form import as_opencv, plain_pixels
 from baarda.geometry import rotation as rot
 from baarda.network import Network
 from baarda.observations import ImagePoints
@@ -59,7 +60,7 @@ def write(network: Network, path: Path) -> None:
     for label in (*images.labels, *points.labels, *(c.label for c in network.cameras)):
         if not label.strip() or "\t" in label or "\n" in label or "\r" in label:
             raise UsageError(f"OpenSfM's tracks cannot hold the name {label!r}")
-    shift = first_pixel(network)
+    shift = first_pixel(network) or 0.0
     rotation = _AXES @ images.rotation
     vectors, translation = rot.log(rotation), -np.einsum("nij,nj->ni", rotation, images.position)
     model: dict[str, Any] = {
@@ -87,10 +88,10 @@ def write(network: Network, path: Path) -> None:
 def _camera(camera: Camera, shift: float) -> dict[str, Any]:
     """Return a camera in OpenSfM's terms."""
     name = camera.model.name
-    plain = (
-        camera.unit == "px" and camera.y_down and (np.asarray(camera.pixel_size) == 1.0).all() and (np.asarray(camera.origin) == 0.0).all()
-    )
-    if name not in (*_SINGLE, *_DOUBLE) or not plain:
+    other = None if name in (*_SINGLE, *_DOUBLE) else as_opencv(camera)
+    if other is not None and any(other[n] != 0.0 for n in ("k4", "k5", "k6")):
+        other = None
+    if (name not in (*_SINGLE, *_DOUBLE) and other is None) or not plain_pixels(camera):
         raise UsageError(
             f"camera {camera.label}: OpenSfM has no model {name!r} with these pixels; it holds {', '.join((*_SINGLE, *_DOUBLE))} in pixels "
             "from the upper left corner, y down"
@@ -99,17 +100,22 @@ def _camera(camera: Camera, shift: float) -> dict[str, Any]:
         raise UsageError(f"camera {camera.label}: OpenSfM needs the image size")
     width, height = (int(s) for s in camera.image_size)
     side = float(max(width, height))
+    if other is not None:
+        centre = {f"c_{a}": (other[f"c{a}"] - shift - 0.5 * (n - 1.0)) / side for a, n in (("x", width), ("y", height))}
+        focal_pair = {f"focal_{a}": other[f"f{a}"] / side for a in "xy"}
+        brown = {"projection_type": "brown", "width": width, "height": height, **focal_pair, **centre}
+        return {**brown, **{n: other[n] for n in _BROWN}}
     value = dict(zip(camera.model.order, np.asarray(camera.values, dtype=float).tolist(), strict=True))
     state = dict(zip(camera.model.order, np.asarray(camera.states).tolist(), strict=True))
-    centre = [(value[f"principal_point_{a}"] - shift - 0.5 * (n - 1.0)) / side for a, n in (("x", width), ("y", height))]
+    middle = [(value[f"principal_point_{a}"] - shift - 0.5 * (n - 1.0)) / side for a, n in (("x", width), ("y", height))]
     k = {n: value.get(n, 0.0) for n in _BROWN}
     zero = {n for n in _BROWN if k[n] == 0.0 and state.get(n, FIXED) == FIXED}
     size = {"width": width, "height": height}
     single = name in _SINGLE
     focal = [value["principal_distance"]] * 2 if single else [value["principal_distance_x"], value["principal_distance_y"]]
-    if single and centre == [0.0, 0.0]:
+    if single and middle == [0.0, 0.0]:
         return {"projection_type": "perspective", **size, "focal": focal[0] / side, "k1": k["k1"], "k2": k["k2"]}
-    pair = {"focal_x": focal[0] / side, "focal_y": focal[1] / side, "c_x": centre[0], "c_y": centre[1]}
+    pair = {"focal_x": focal[0] / side, "focal_y": focal[1] / side, "c_x": middle[0], "c_y": middle[1]}
     if {"k2", "k3", "p1", "p2"} <= zero:
         return {"projection_type": "simple_radial", **size, **pair, "k1": k["k1"]}
     if {"k3", "p1", "p2"} <= zero:

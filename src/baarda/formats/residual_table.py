@@ -433,7 +433,8 @@ def _from_columns(file: Path, columns: dict[str, Any], numeric: Sequence[str], w
     for name in choice.numeric:
         if name not in numeric:
             raise InputError(f"column {name!r} holds {columns[name].dtype}, not real numbers", file)
-    numbers = {name: np.array(columns[name], dtype=float) for name in choice.numeric}
+    with np.errstate(invalid="ignore"):  # signalling NaNs are told by name later
+        numbers = {name: np.array(columns[name], dtype=float) for name in choice.numeric}
     groups, names = None, tuple[str, ...]()
     if choice.group is not None:
         found = columns[choice.group]

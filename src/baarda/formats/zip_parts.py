@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import lzma
 import zipfile
 import zlib
 from pathlib import Path
@@ -14,6 +15,8 @@ MOST_PARTS = 200_000
 LARGEST_PART = 2 * 1024**3  # bytes, unpacked
 LARGEST_RATIO = 200  # unpacked bytes per packed byte of the whole archive
 SMALL = 1024**2  # parts below this size may be packed more densely
+#: what damaged parts end in
+DAMAGE = (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, RuntimeError, EOFError, zlib.error, lzma.LZMAError)
 
 
 class Parts:
@@ -66,7 +69,7 @@ class Parts:
         try:
             with self._zip.open(info) as f:
                 data = f.read(limit + 1)
-        except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
+        except DAMAGE as error:
             raise InputError(f"part {name!r} cannot be read: {error}", self.path) from None
         if len(data) > limit:
             raise InputError(f"part {name!r} unpacks to more than {limit} bytes", self.path)
