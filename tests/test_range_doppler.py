@@ -8,6 +8,8 @@ from scipy import optimize, stats
 
 import baarda
 from baarda import adjust
+from baarda.adjustment.datum import Defect
+from baarda.adjustment.solve import Settings, choose_datum
 from baarda.cameras import FIXED, OBSERVED
 from baarda.errors import InputError, RedundancyNotPositive, Singular, UsageError
 from baarda.formats.project import project
@@ -476,3 +478,15 @@ def test_priors_of_tracks_can_be_removed_and_predicted(made):
     network = replace(made.network, declared=(replace(made.network.declared[0], states=states, given=given, sigmas=sigmas),))
     found, _ = snoop(network, Options(), "coordinate", None)
     assert [(s.action, s.group, s.component) for s in found.steps] == [("rejected", "track parameters", "Z0")]
+
+
+def test_inner_constraints_reach_a_track_over_points_that_are_held(made, monkeypatch):
+    """Where neither free points nor images can take the constraints, the unknowns of the track do."""
+    a = adjust(made.network)
+    track = a.numbering["track"].columns
+    basis = np.zeros((a.numbering.count, 1))
+    basis[track[track >= 0][0]] = 1.0
+    monkeypatch.setattr("baarda.adjustment.solve.minimal_columns", lambda defect, lin, candidates: candidates[:1])
+    datum = choose_datum(Defect(basis, ("rotation about X",)), a.lin, Settings(), a.network)
+    assert "over all unknowns" in datum.text
+    assert np.isfinite(datum.transfer).all()

@@ -203,5 +203,5 @@ def test_a_test_that_misses_its_level_is_named(planned):
     bad = replace(told, name="bad", rate=0.3, expected=0.1, z=9.0)
     from baarda.report.simulation_verdict import sentences
 
-    text = next(s.text for s in sentences(planned, replace(proof, sizes=(good, bad))) if s.subject == "sizes")
+    text = next(s.text for s in sentences(planned, replace(proof, sizes=(good, bad))) if s.subject == "Sizes of tests")
     assert text == "1 of 2 tests of true hypotheses reject as often as their level says; not so: bad (30 % instead of 10 %)."

@@ -58,7 +58,7 @@ def test_levelling_tells_its_heights_alone(folder):
 
 def test_a_plan_without_images_has_its_figures_by_unit(local):
     made = plan(local)
-    text = said(planned_sentences(made, None), "reliability")
+    text = said(planned_sentences(made, None), "Reliability")
     assert " rad (median; largest " in text
     assert " m (median; largest " in text
 

@@ -317,11 +317,14 @@ def choose_datum(defect: Defect, lin: Linearization, settings: Settings, network
         names = ", ".join(unknowns.names[i] for i in held)
         return Datum("minimal", defect, held, None, f"Minimal constraints hold {defect.count} unknown(s) at their start values: {names}.")
     on = np.zeros(unknowns.count)
-    on[columns[columns >= 0]] = 1.0
-    where = "all object points"
-    conditions = defect.basis * on[:, None]
-    if np.linalg.matrix_rank(conditions) < defect.count:
-        on[images[images >= 0]] = 1.0
-        where, conditions = "all object points and images", defect.basis * on[:, None]
+    for where, added in (
+        ("all object points", columns[columns >= 0]),
+        ("all object points and images", images[images >= 0]),
+        ("all unknowns", np.arange(unknowns.count)),  # a track over points that are held on one line
+    ):
+        on[added] = 1.0
+        conditions = defect.basis * on[:, None]
+        if np.linalg.matrix_rank(conditions) == defect.count:
+            break
     text = f"Free network: {defect.count} inner constraint(s) over {where} tie down {free}."
     return Datum("inner", defect, held, conditions, text)
