@@ -12,6 +12,7 @@ FLOORS = {
     "distributions": 1,
     "network": 2,
     "hypotheses": 2,
+    "executors": 2,
     "observations": 3,
     "adjustment": 4,
     "formats": 4,

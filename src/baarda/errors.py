@@ -2,13 +2,37 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+
+LONGEST = 2000  # characters of a message: a stranger's file may hold a word of any length
+_HIDDEN = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufeff]")
+
+
+def shown(text: str) -> str:
+    r"""Return a text that is safe to print: control characters as escapes, the middle of a very long one left out.
+
+    Examples
+    --------
+    >>> shown("no point 'a\x1b[31m'")
+    "no point 'a\\x1b[31m'"
+    >>> len(shown("9" * 5000)) < 2100
+    True
+    """
+    text = _HIDDEN.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
+    if len(text) <= LONGEST:
+        return text
+    half = LONGEST // 2
+    return f"{text[:half]} ... ({len(text) - 2 * half} characters left out) ... {text[-half:]}"
 
 
 class BaardaError(Exception):
     """Base of all errors that the command line prints as one message; `exit_code` is its exit status."""
 
     exit_code = 2
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(shown(str(message)))
 
 
 class UsageError(BaardaError):

@@ -10,6 +10,7 @@ import numpy as np
 
 from baarda.adjustment.structure import Structure
 from baarda.errors import NotEnoughMemory
+from baarda.executors import memory_limit
 from baarda.network import Unknowns
 from baarda.observations import Kind
 
@@ -18,8 +19,11 @@ TOLD_FROM = 0.5e9  # bytes
 
 
 def available() -> float:
-    """Return the bytes that this process may still take, of the machine or its control group; infinite where the system tells nothing."""
+    """Return the bytes that this process may still take of the machine, its control group or worker; infinite where nothing is told."""
     found = [np.inf]
+    limit_of_worker = memory_limit()
+    if np.isfinite(limit_of_worker):
+        found.append(limit_of_worker - _resident())
     try:
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
@@ -34,6 +38,15 @@ def available() -> float:
     except (OSError, ValueError):  # "max", or no control group
         pass
     return min(found)
+
+
+def _resident() -> float:
+    """Return the bytes this process has, 0 where the system does not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except (OSError, ValueError, IndexError):
+        return 0.0
+    return float(pages) * float(os.sysconf("SC_PAGE_SIZE"))
 
 
 def of_rows(unknowns: Unknowns, groups: Sequence[Kind]) -> float:

@@ -308,20 +308,22 @@ def choose_datum(defect: Defect, lin: Linearization, settings: Settings, network
     early[columns[eliminated].ravel()] = True
     images = unknowns["image"].columns
     held = none
-    for candidates in (images[images >= 0], np.flatnonzero(~early[:-1]), np.arange(unknowns.count)):
-        if len(candidates) >= defect.count and not len(held):
-            held = minimal_columns(defect, lin, candidates)
+    for some in (images[images >= 0], np.flatnonzero(~early[:-1]), np.arange(unknowns.count)):
+        if len(some) >= defect.count and not len(held):
+            held = minimal_columns(defect, lin, some)
     if len(held) < defect.count:
         raise DatumDefect(f"the datum defect {defect.count} ({free}) cannot be removed by holding unknowns")
     if settings.datum == "minimal":
         names = ", ".join(unknowns.names[i] for i in held)
         return Datum("minimal", defect, held, None, f"Minimal constraints hold {defect.count} unknown(s) at their start values: {names}.")
     on = np.zeros(unknowns.count)
-    for where, added in (
-        ("all object points", columns[columns >= 0]),
-        ("all object points and images", images[images >= 0]),
-        ("all unknowns", np.arange(unknowns.count)),  # a track over points that are held on one line
-    ):
+    candidates = {
+        "all object points": columns[columns >= 0],
+        "all object points and images": images[images >= 0],
+        "all unknowns": np.arange(unknowns.count),  # as of a track over points that are held on one line
+    }
+    where, conditions = "", defect.basis
+    for where, added in candidates.items():  # noqa: B007
         on[added] = 1.0
         conditions = defect.basis * on[:, None]
         if np.linalg.matrix_rank(conditions) == defect.count:

@@ -4,7 +4,20 @@ from importlib import import_module
 
 from baarda.cli.base import app
 
-for _verb in ("demo", "adjust", "residuals", "compare", "simulate", "reproduce", "convert", "lists"):  # the order of the help
+for _verb in (  # the order of the help
+    "demo",
+    "adjust",
+    "batch",
+    "split",
+    "resect",
+    "models",
+    "residuals",
+    "compare",
+    "simulate",
+    "reproduce",
+    "convert",
+    "lists",
+):
     import_module(f"baarda.cli.{_verb}")
 
 

@@ -23,9 +23,28 @@ app = typer.Typer(
 
 Out = Annotated[Path | None, typer.Option("--out", help="Result folder to write; there whole or not at all.", show_default=False)]
 Control = Annotated[Path | None, typer.Option("--control", help="Table of control and check points.", show_default=False)]
+MarksFile = Annotated[
+    Path | None,
+    typer.Option("--marks", help="Table of image marks (image, point, x, y, sigma) of control and check points.", show_default=False),
+]
+Crs = Annotated[
+    str | None,
+    typer.Option(
+        "--crs",
+        help="Coordinate system of the tables of --control and --camera-positions: EPSG:25832, EPSG:25832+7837, WKT (extra geo).",
+        show_default=False,
+    ),
+]
+GeoidHeight = Annotated[
+    str | None, typer.Option("--geoid", help="Geoid height in metres, or the file of a grid, for heights of --crs.", show_default=False)
+]
 CameraPositionsFile = Annotated[
     Path | None,
-    typer.Option("--camera-positions", help="Table of measured camera positions (GNSS) with their sigmas.", show_default=False),
+    typer.Option(
+        "--camera-positions",
+        help="Table of measured camera positions (GNSS) with their sigmas; 'source': those of an OpenSfM, Metashape or OPF source.",
+        show_default=False,
+    ),
 ]
 LeverArm = Annotated[
     str, typer.Option("--lever-arm", help="From projection centre to antenna, camera axes: x,y,z (known), free, or free:x,y,z.")
@@ -94,12 +113,29 @@ Power = Annotated[float, typer.Option("--power", help="Power behind minimal dete
 SigmaName = Annotated[str, typer.Option("--sigma", help="Which variance factor judges and scales: aposteriori (tau) or apriori (w).")]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of simulated null laws.")]
 Jobs = Annotated[int | None, typer.Option("--jobs", help="Threads; the results do not depend on it.", min=1, show_default="all cores")]
+Cluster = Annotated[
+    str | None,
+    typer.Option("--cluster", metavar="ADDRESS|local", help="Work on a Dask cluster (extra cluster).", show_default=False),
+]
 Tables = Annotated[str, typer.Option("--tables", help="Format of the tables: csv or parquet.")]
 Language = Annotated[str, typer.Option("--language", help="Language of the report and the verdict: en or de.")]
 Pdf = Annotated[bool, typer.Option("--pdf", help="Write report.pdf, too (extra pdf).")]
 Json = Annotated[bool, typer.Option("--json", help="Print result.json to stdout; the folder is written only with --out.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress and no verdict.")]
 Strict = Annotated[bool, typer.Option("--strict", help="Exit with 1 when the global, outlier, check point or control point test rejects.")]
+
+
+def one_blas_thread(function: Callable[..., None]) -> Callable[..., None]:
+    """Wrap a function so that BLAS uses one thread: more of them would sum in another order."""
+
+    @functools.wraps(function)
+    def wrapped(*args: Any, **options: Any) -> None:
+        from threadpoolctl import threadpool_limits
+
+        with threadpool_limits(limits=1, user_api="blas"):
+            function(*args, **options)
+
+    return wrapped
 
 
 def guarded(function: Callable[..., None]) -> Callable[..., None]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from baarda.cli.base import Alpha, Json, Out, Quiet, Seed, Strict, Tables, app, guarded
+from baarda.cli.base import Alpha, Cluster, Json, Language, Out, Quiet, Seed, Strict, Tables, app, guarded
 from baarda.errors import UsageError
 
 if TYPE_CHECKING:
@@ -72,7 +72,9 @@ def class_limits(text: str) -> tuple[float, ...]:
 @app.command()
 @guarded
 def residuals(
-    table: Annotated[Path, typer.Argument(metavar="TABLE", help="CSV, NPY or Parquet table of residuals.")],
+    table: Annotated[
+        str, typer.Argument(metavar="TABLE|LAKE", help="CSV, NPY or Parquet table of residuals; folder or address of partitioned Parquet.")
+    ],
     out: Out = None,
     column: Annotated[
         str | None, typer.Option("--column", help="Column of the residuals.", show_default="residual, else the only one of numbers")
@@ -90,12 +92,18 @@ def residuals(
     replicas: Annotated[int, typer.Option("--replicas", help="Simulated samples of each null law.")] = 999,
     alpha: Alpha = 0.05,
     seed: Seed = 0,
+    cluster: Cluster = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", help="LAKE: processes; the results do not depend on it.", min=1, show_default="all cores")
+    ] = None,
     tables: Tables = "csv",
+    language: Language = "en",
     as_json: Json = False,
     quiet: Quiet = False,
     strict: Strict = False,
 ) -> None:
     """Study a plain table of residuals: moments, homogeneity, laws of errors (default folder: baarda-residuals)."""
+    from baarda.formats.residual_lake import is_lake
     from baarda.procedures.law_study import StudyOptions
     from baarda.report.residual_report import run
 
@@ -107,8 +115,15 @@ def residuals(
     target = None if as_json and out is None else out or Path("baarda-residuals")
     if not quiet:
         typer.echo("studying ...", err=True)
-    with reading(quiet) as progress:
-        outcome = run(table, target, column, group, options, sigma=sigma, redundancy=redundancy, tables=tables, progress=progress)
+    if is_lake(table):
+        columns = (column, group, sigma, redundancy)
+        outcome = study_lake(table, target, columns, options, {"tables": tables, "spoken": language}, (cluster, jobs), quiet, started)
+    elif cluster is not None:
+        raise UsageError("--cluster is for a folder or an address of partitioned Parquet: one table is studied on this machine")
+    else:
+        with reading(quiet) as progress:
+            known = {"sigma": sigma, "redundancy": redundancy}
+            outcome = run(table, target, column, group, options, **known, tables=tables, spoken=language, progress=progress)  # type: ignore[arg-type]
     if as_json:
         typer.echo(json.dumps(outcome.document, indent=1, allow_nan=False, ensure_ascii=False))
     elif not quiet:
@@ -121,3 +136,45 @@ def residuals(
         failed = ", ".join(name for name, rejected in outcome.study.gates.items() if rejected)
         typer.echo(f"baarda: rejected: {failed}", err=True)
         raise typer.Exit(1)
+
+
+def study_lake(
+    address: str,
+    target: Path | None,
+    columns: tuple[str | None, ...],
+    options: Any,
+    written: dict[str, str],
+    who: tuple[str | None, int | None],
+    quiet: bool,
+    started: float,
+) -> Any:
+    """Study partitioned Parquet on as many workers as there are."""
+    from baarda.executors import open_workers
+    from baarda.report.lake_report import run_lake
+
+    tell = None if quiet else lambda text: typer.echo(text, err=True)
+    last = [started]
+
+    def progress(done: int, total: int, rows: int) -> None:
+        now = time.perf_counter()
+        if done == total or now - last[0] > 2.0:
+            last[0] = now
+            typer.echo(f"{done:>{len(str(total))}} of {total} files, {rows:.4g} rows, {now - started:.0f} s", err=True)
+
+    column, group, sigma, redundancy = columns
+    cluster, jobs = who
+    with open_workers(cluster, jobs, tell=tell) as workers:
+        return run_lake(
+            address,
+            target,
+            column,
+            group,
+            options,
+            sigma=sigma,
+            redundancy=redundancy,
+            **written,
+            facts={"workers": workers.name},
+            workers=workers,
+            progress=None if quiet else progress,
+            tell=tell,
+        )

@@ -11,9 +11,11 @@ from typing import Any
 
 import typer
 
+from baarda.cli.base import one_blas_thread
 from baarda.errors import OutputError, UsageError
 
 
+@one_blas_thread
 def adjust_and_report(
     network: Any,
     settings: dict[str, Any],

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from baarda.errors import InputError, MissingExtra
+from baarda.formats.npy_array import map_array
 from baarda.formats.residual_table import GROUPS, HEADER_ERRORS, REDUNDANCY, RESIDUAL, SIGMA
 from baarda.formats.value_stream import ValueStream, open_values
 
@@ -42,6 +41,7 @@ def open_long(
     Examples
     --------
     >>> import tempfile
+    >>> import numpy as np
     >>> file = Path(tempfile.mkdtemp()) / "v.npy"
     >>> np.save(file, np.arange(5.0))
     >>> open_long(file) is None, open_long(file, least=5)[0].total
@@ -56,7 +56,7 @@ def open_long(
         if head.startswith(b"PAR1"):
             names = tuple(_parquet_names(file))
         else:
-            data = np.load(file, mmap_mode="r", allow_pickle=False)
+            data = map_array(file)
             if data.ndim != 1:
                 return None
             names = tuple(data.dtype.names or ())

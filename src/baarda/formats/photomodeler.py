@@ -53,13 +53,13 @@ def read(path: Path) -> Network:
     if len(lines[1].fields) < 4:
         raise lines[1].error("the image size in pixels is missing (fields 3 and 4)")
     size = (lines[1].number_at(2, "image width"), lines[1].number_at(3, "image height"))
-    if min(size) <= 0:
-        raise lines[1].error(f"the image size in pixels must be positive, not {size[0]:g} x {size[1]:g}")
+    if not all(1e-3 < side < 1e9 for side in size):
+        raise lines[1].error(f"the image size in pixels must be positive and that of an image, not {size[0]:g} x {size[1]:g}")
     default = [lines[3].number_at(i, "camera value") for i in range(10)]
     if default[0] <= 0:
         raise lines[3].error(f"the principal distance must be positive, not {default[0]!r}")
-    if min(default[3:5]) <= 0:
-        raise lines[3].error(f"the format size must be positive, not {default[3]!r} x {default[4]!r}")
+    if not all(1e-6 < side < 1e6 for side in default[3:5]):  # mm
+        raise lines[3].error(f"the format size must be positive and that of a sensor, not {default[3]!r} x {default[4]!r}")
     cursor = iter(lines[5:])
     labels, names, exterior = _photographs(cursor)
     _section(cursor, 7)  # control points as adjusted: not what was given

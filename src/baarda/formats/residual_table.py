@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import math
 import tokenize
-import warnings
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from baarda.errors import InputError, MissingExtra
 from baarda.formats.base import LARGEST, regular_size
+from baarda.formats.npy_array import map_array
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -399,9 +399,7 @@ HEADER_ERRORS = (
 
 def _read_npy(file: Path, wanted: _Wanted, assumptions: list[str]) -> tuple[_Choice, _Raw]:
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of headers that Python 2 wrote
-            data = np.load(file, mmap_mode="r", allow_pickle=False)
+        data = map_array(file)
     except HEADER_ERRORS as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         if "pickle" in reason or "object" in reason.lower():

@@ -128,6 +128,8 @@ def _open_npy(file: Path, column: str | None, piece: int) -> _Npy:
             offset = f.tell()
     except ValueError as error:
         raise InputError(f"damaged NPY header: {error}", file) from None
+    if any(type(n) is not int or n < 0 for n in shape):
+        raise InputError(f"damaged NPY header: {shape} is not the shape of an array", file)
     total = int(np.prod(shape, dtype=np.int64))
     if file.stat().st_size < offset + total * dtype.itemsize:
         raise InputError(f"the file ends before its {total} values", file)

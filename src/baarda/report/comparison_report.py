@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import platform
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,16 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import baarda
-from baarda.formats.folder import Mark, whole_folder
+from baarda.formats.folder import Mark
 from baarda.hypotheses.base import TestResult
 from baarda.network import AXES, Table
 from baarda.observations import ImagePoints
 from baarda.procedures.comparison import Comparison, Epoch
 from baarda.report import page
-from baarda.report.result_folder import _parquet, plain, table_csv
-from baarda.report.sections._numbers import decimals_for, finer, fixed, names, plural, probability, significant
-from baarda.report.sections.base import Block, Cell, Column, DataTable, Paragraph, Section, Sentence, Tone, Verdict, say
+from baarda.report.contents import Contents, plain, software, write
+from baarda.report.sections._numbers import decimals_for, finer, fixed, names, p_stated, plural, probability, significant
+from baarda.report.sections.base import Block, Cell, Column, DataTable, Paragraph, Section, Sentence, Tone, Verdict, say, told, translated
+from baarda.report.translation import language, tr
 
 Floats = NDArray[np.float64]
 
@@ -31,7 +29,7 @@ _MOST = 200
 
 def sentences(c: Comparison) -> list[Sentence]:
     """Return the verdict."""
-    out = [Sentence("datum", _datum(c), "info", "epochs")]
+    out = [Sentence("Datum", _datum(c), "info", "epochs")]
     if c.dependent:
         size = _length(c.differences)
         i = int(np.argmax(size))
@@ -40,59 +38,59 @@ def sentences(c: Comparison) -> list[Sentence]:
         text = say(
             "Both adjust the same {what}, so their differences are no random sample and nothing is tested: root mean square "
             "{rms} {unit}, largest {largest} {unit} (point {label}), at most {share} standard deviations of the first.",
-            what="image points" if any(isinstance(g, ImagePoints) for g in c.first.observations) else "observations",
+            what=tr("image points" if any(isinstance(g, ImagePoints) for g in c.first.observations) else "observations"),
             rms=significant(float(np.sqrt((size**2).mean())) * factor),
             unit=unit,
             largest=significant(float(size[i]) * factor),
             label=c.labels[i],
             share=significant(float(np.nanmax(shares))),
         )
-        out.append(Sentence("differences", text, "info", "points"))
+        out.append(Sentence("Differences", text, "info", "points"))
         return out + _noted(c)
     if c.variance_ratio is not None:
         t = c.variance_ratio
         low, high = t.critical if isinstance(t.critical, tuple) else (0.0, t.critical)
         text = say(
-            "Variance factors {a} and {b}: ratio {ratio}, limits {low} and {high}, p = {p}: the epochs are {word} precise.",
+            "Variance factors {a} and {b}: ratio {ratio}, limits {low} and {high}, p {p}: the epochs are {word} precise.",
             a=significant(c.first.variance_factor),
             b=significant(c.second.variance_factor),
             ratio=significant(float(t.statistic)),
             low=significant(low),
             high=significant(high),
-            p=probability(t.p_value),
-            word="not equally" if t.rejected else "equally",
+            p=p_stated(t.p_value),
+            word=tr("not equally" if t.rejected else "equally"),
         )
-        out.append(Sentence("precision", text, "warn" if t.rejected else "good", "tests"))
+        out.append(Sentence("Precision", text, "warn" if t.rejected else "good", "tests"))
     if c.congruence is not None:
         t = c.congruence
         text = say(
-            "Congruence of {count} points: T = {statistic}, limit {critical} ({law}), p = {p}: {word}.",
+            "Congruence of {count} points: T = {statistic}, limit {critical} ({law}), p {p}: {word}.",
             count=len(c.labels),
             statistic=significant(float(t.statistic)),
             critical=significant(float(t.critical)) if not isinstance(t.critical, tuple) else "",
             law=t.law_name,
-            p=probability(t.p_value),
-            word="points have moved, or a model is wrong" if t.rejected else "no movement is proven",
+            p=p_stated(t.p_value),
+            word=tr("points have moved, or a model is wrong" if t.rejected else "no movement is proven"),
         )
-        out.append(Sentence("congruence", text, "bad" if t.rejected else "good", "tests"))
+        out.append(Sentence("Congruence", text, "bad" if t.rejected else "good", "tests"))
     found = c.localisation
     if found is not None:
         at = [c.labels.index(p) for p in found.moved]
         unit, factor = finer(c.first.network.unit, _length(c.differences[at]) if at else [])
-        told = [f"{p} ({significant(float(_length(c.differences[[i]])[0]) * factor)} {unit})" for p, i in zip(found.moved, at, strict=True)]
+        far = [f"{p} ({significant(float(_length(c.differences[[i]])[0]) * factor)} {unit})" for p, i in zip(found.moved, at, strict=True)]
         text = say(
             "{count} moved: {names}; {stable} held stable {word}.",
             count=plural(len(found.moved), "point"),
-            names=names(told, 10),
+            names=names(far, 10),
             stable=plural(len(found.stable), "point"),
-            word="are congruent" if found.decided else "are still not congruent",
+            word=tr("are congruent" if found.decided else "are still not congruent"),
         )
-        out.append(Sentence("moved", text, "bad", "points"))
+        out.append(Sentence("Moved points", text, "bad", "points"))
     return out + _noted(c)
 
 
 def _noted(c: Comparison) -> list[Sentence]:
-    return [Sentence("note", text, "warn") for text in c.notes]
+    return [Sentence("Note", told(text), "warn") for text in c.notes]
 
 
 def _datum(c: Comparison) -> str:
@@ -101,7 +99,7 @@ def _datum(c: Comparison) -> str:
     return say(
         "{count} common points are compared after an S-transformation to one datum: {freedoms} are taken out.",
         count=len(c.labels),
-        freedoms=", ".join(c.freedoms),
+        freedoms=", ".join(tr(f) for f in c.freedoms),
     )
 
 
@@ -143,7 +141,8 @@ def sections(c: Comparison) -> list[Section]:
     made = [Section("verdict", "Verdict", (Verdict(tuple(sentences(c))),)), Section("epochs", "The two adjustments", tuple(_epochs(c)))]
     if c.congruence is not None:
         made.append(Section("tests", "Tests", tuple(_tests(c))))
-    return [*made, Section("points", "Differences of the points", (_points(c),))]
+    made.append(Section("points", "Differences of the points", (_points(c),)))
+    return [translated(s) for s in made]
 
 
 def _epochs(c: Comparison) -> list[Block]:
@@ -153,7 +152,7 @@ def _epochs(c: Comparison) -> list[Block]:
         rows.append(
             (
                 word,
-                e.network.path or e.network.name or "in memory",
+                e.network.path or e.network.name or tr("in memory"),
                 "as it is" if e.as_it_is else "adjusted",
                 str(a.count),
                 str(a.numbering.count),
@@ -190,7 +189,7 @@ def _epochs(c: Comparison) -> list[Block]:
 
 
 def _row(words: str, t: TestResult) -> tuple[str | Cell, ...]:
-    critical = " and ".join(significant(float(x)) for x in np.atleast_1d(np.asarray(t.critical)))
+    critical = "..".join(significant(float(x)) for x in np.atleast_1d(np.asarray(t.critical)))
     decision = Cell("rejected", "bad") if t.rejected else Cell("not rejected", "good")
     return words, significant(float(t.statistic)), t.law_name, critical, probability(float(t.p_value)), decision
 
@@ -201,7 +200,7 @@ def _tests(c: Comparison) -> list[Block]:
         rows.append(_row("congruence of all points", c.congruence))
     if c.localisation is not None:
         for moved, t in zip(c.localisation.moved, c.localisation.steps[1:], strict=False):
-            rows.append(_row(f"congruence without {moved}", t))
+            rows.append(_row(say("congruence without {point}", point=moved), t))
     columns = (
         Column("hypothesis", "", "", "left"),
         Column("T", "", "test statistic"),
@@ -260,8 +259,6 @@ def result_json(c: Comparison) -> dict[str, Any]:
     dict
         JSON-compatible; numbers that do not exist are None.
     """
-    import scipy
-
     tests = [t for t in (c.variance_ratio, c.congruence) if t is not None]
     document = {
         "schema": SCHEMA,
@@ -283,13 +280,7 @@ def result_json(c: Comparison) -> dict[str, Any]:
         "rejected": c.rejected,
         "notes": list(c.notes),
         "verdict": verdict(c),
-        "software": {
-            "name": "baarda",
-            "version": baarda.__version__,
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "scipy": str(scipy.__version__),
-        },
+        "software": software(),
     }
     return dict(plain(document))
 
@@ -326,7 +317,9 @@ def tables(c: Comparison) -> dict[str, Table]:
     return {"points": Table(columns)}
 
 
-def write_folder(c: Comparison, out: str | Path, table_format: str = "csv", facts: Mapping[str, Any] | None = None) -> Path:
+def write_folder(
+    c: Comparison, out: str | Path, table_format: str = "csv", facts: Mapping[str, Any] | None = None, spoken: str = "en"
+) -> Path:
     """Write the result folder.
 
     Parameters
@@ -337,6 +330,8 @@ def write_folder(c: Comparison, out: str | Path, table_format: str = "csv", fact
     table_format : {"csv", "parquet"}
     facts : mapping, optional
         For `run.json`.
+    spoken : str
+        Language of the report; JSON and tables are English.
 
     Returns
     -------
@@ -349,29 +344,31 @@ def write_folder(c: Comparison, out: str | Path, table_format: str = "csv", fact
     OutputError
         If it cannot be written; nothing is left behind.
     """
-    target = Path(out)
-    made = sections(c)
+    document, content = result_json(c), tables(c)
+    with language(spoken):
+        made = sections(c)
+        contents = Contents(document, html(c, made), page.figures(made), content, facts or {})
+    return write(contents, out, MARK, table_format)
+
+
+def html(c: Comparison, made: list[Section]) -> str:
+    """Return the report as one page.
+
+    Parameters
+    ----------
+    c : Comparison
+    made : list of Section
+        See `sections`.
+
+    Returns
+    -------
+    str
+    """
     tones: list[Tone] = [s.tone for s in sentences(c)]
     whole = ("bad", "Points have moved") if "bad" in tones else ("warn", "Needs attention") if "warn" in tones else ("good", "No movement")
     if c.dependent:
         whole = ("info", "Described, not tested")
-    told = [("points", str(len(c.labels))), ("s0 first", f"{c.first.variance_factor**0.5:.4g}")]
-    told.append(("s0 second", f"{c.second.variance_factor**0.5:.4g}"))
-    name = " and ".join(e.network.path or e.network.name or "in memory" for e in (c.first, c.second))
-    texts = {
-        "result.json": json.dumps(result_json(c), indent=1, allow_nan=False, ensure_ascii=False) + "\n",
-        "report.html": page.render("Comparison report", name, "compared", whole, told, made),
-        "run.json": json.dumps(plain(dict(facts or {})), indent=1, allow_nan=False) + "\n",
-    }
-    content = tables(c)
-    if table_format == "csv":
-        texts |= {f"tables/{n}.csv": table_csv(t) for n, t in content.items()}
-    with whole_folder(target, MARK) as folder:
-        for n in ("tables", "figures"):
-            (folder / n).mkdir()
-        for n, text in texts.items():
-            (folder / n).write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
-        if table_format == "parquet":
-            for n, t in content.items():
-                _parquet(t, folder / "tables" / f"{n}.parquet")
-    return target
+    head = [("points", str(len(c.labels))), ("s0 first", f"{c.first.variance_factor**0.5:.4g}")]
+    head.append(("s0 second", f"{c.second.variance_factor**0.5:.4g}"))
+    name = say("{a} and {b}", **{k: e.network.path or e.network.name or tr("in memory") for k, e in (("a", c.first), ("b", c.second))})
+    return page.render("Comparison report", name, "compared", (whole[0], tr(whole[1])), head, made)

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import platform
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-import baarda
-from baarda.errors import InputError, MissingExtra, UsageError
+from baarda.errors import InputError, UsageError
 from baarda.formats import digest
-from baarda.formats.folder import Mark, check_target, whole_folder
+from baarda.formats.folder import Mark, check_target
 from baarda.formats.long_column import open_long
 from baarda.formats.residual_table import ResidualTable, read
 from baarda.formats.value_stream import ParquetStream, ValueStream
@@ -23,11 +20,12 @@ from baarda.procedures.law_study import StudyOptions
 from baarda.procedures.long_study import study_long
 from baarda.procedures.residual_study import ResidualStudy, study
 from baarda.report import page
+from baarda.report.contents import Contents, check_tables, plain, software, write
 from baarda.report.laws_json import law_json, scale_rule_json
 from baarda.report.residual_sections import sections
 from baarda.report.residual_verdict import sentences
-from baarda.report.result_folder import plain, table_csv
 from baarda.report.sections.base import Section
+from baarda.report.translation import check_language, language, tr
 
 SCHEMA = "baarda.residuals/1"
 MARK = Mark("result.json", "baarda.residuals/", ("report.html", "result.json", "run.json", "tables", "figures"))
@@ -52,6 +50,7 @@ def run(
     redundancy: str | None = None,
     tables: str = "csv",
     facts: Mapping[str, Any] | None = None,
+    spoken: str = "en",
     progress: Callable[[int, int], None] | None = None,
 ) -> Outcome:
     """Read a table of residuals, study it, and write the result folder.
@@ -71,6 +70,8 @@ def run(
         Format of the tables of the folder.
     facts : mapping, optional
         What differs from run to run (timings), for `run.json`.
+    spoken : str
+        Language of report and verdict; JSON and tables are English.
     progress : callable, optional
         Called with the numbers of values read and in all, while a long column is read.
 
@@ -87,8 +88,8 @@ def run(
     UsageError
         If options make no sense for the table.
     """
-    if tables not in ("csv", "parquet"):
-        raise UsageError(f"tables are csv or parquet, not {tables!r}")
+    check_tables(tables)
+    check_language(spoken)
     if out is not None:
         check_target(Path(out), MARK)
     o = StudyOptions() if options is None else options
@@ -99,8 +100,9 @@ def run(
         table, found = _in_memory(path, (column, group, sigma, redundancy), o)
     document = result_json(table, found)
     if out is not None:
-        write_folder(table, found, out, tables, facts)
-    return Outcome(found, verdict(table, found), document)
+        write_folder(table, found, out, tables, facts, spoken)
+    with language(spoken):
+        return Outcome(found, verdict(table, found), document)
 
 
 def _in_memory(path: str | Path, columns: tuple[str | None, ...], o: StudyOptions) -> tuple[ResidualTable, ResidualStudy]:
@@ -145,21 +147,21 @@ def verdict(table: ResidualTable, found: ResidualStudy) -> list[str]:
 # ---- JSON and tables ----------------------------------------------------------------------------------------------------------------
 
 
-def result_json(table: ResidualTable, found: ResidualStudy) -> dict[str, Any]:
+def result_json(table: ResidualTable, found: ResidualStudy, sha256: str | None = None) -> dict[str, Any]:
     """Return the content of `result.json`; its schema is "baarda.residuals/1".
 
     Parameters
     ----------
     table : ResidualTable
     found : ResidualStudy
+    sha256 : str, optional
+        Of the source; by default that of the file.
 
     Returns
     -------
     dict
         JSON-compatible; infinite numbers (a = inf is the normal law) are None.
     """
-    import scipy
-
     o, groups = found.options, found.groups
     every = (*found.tests, *(groups.tests if groups is not None else ()), *((found.laws.ratio,) if found.laws.ratio is not None else ()))
     document = {
@@ -167,7 +169,7 @@ def result_json(table: ResidualTable, found: ResidualStudy) -> dict[str, Any]:
         "source": {
             "path": table.path,
             "format": table.format,
-            "sha256": digest(Path(table.path)),
+            "sha256": digest(Path(table.path)) if sha256 is None else sha256,
             "columns": {"residual": table.column, "group": table.group, "sigma": table.sigma, "redundancy": table.redundancy},
         },
         "assumptions": list(table.assumptions),
@@ -203,13 +205,7 @@ def result_json(table: ResidualTable, found: ResidualStudy) -> dict[str, Any]:
         "chi_square_ratios": {"descriptive": True, "values": found.laws.chi_square_ratios},
         "left_out": [{"what": what, "why": why} for what, why in found.left_out],
         "verdict": verdict(table, found),
-        "software": {
-            "name": "baarda",
-            "version": baarda.__version__,
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "scipy": str(scipy.__version__),
-        },
+        "software": software(),
     }
     return dict(plain(document))
 
@@ -318,14 +314,20 @@ def html(table: ResidualTable, found: ResidualStudy, made: list[Section]) -> str
     """
     tones = [s.tone for s in sentences(table, found)]
     bad, warn = tones.count("bad"), tones.count("warn")
-    overall = ("bad", "A test of the model failed") if bad else ("warn", "The law needs attention") if warn else ("good", "No test failed")
+    passed = ("warn", "The law needs attention") if warn else ("good", "No test failed")
+    tone, words = ("bad", "A test of the model failed") if bad else passed
     facts = [("values", str(found.n)), ("column", table.column), ("groups", "-" if found.groups is None else str(len(found.groups.names)))]
     facts += [("mean", f"{found.mean:.3g}"), ("standard deviation", f"{found.deviation:.4g}")]
-    return page.render("Residual report", table.path, "studied", overall, facts, made)
+    return page.render("Residual report", table.path, "studied", (tone, tr(words)), facts, made)
 
 
 def write_folder(
-    table: ResidualTable, found: ResidualStudy, out: str | Path, tables: str = "csv", facts: Mapping[str, Any] | None = None
+    table: ResidualTable,
+    found: ResidualStudy,
+    out: str | Path,
+    tables: str = "csv",
+    facts: Mapping[str, Any] | None = None,
+    spoken: str = "en",
 ) -> Path:
     """Write the result folder.
 
@@ -338,6 +340,8 @@ def write_folder(
     tables : {"csv", "parquet"}
     facts : mapping, optional
         For `run.json`.
+    spoken : str
+        Language of the report; JSON and tables are English.
 
     Returns
     -------
@@ -350,30 +354,8 @@ def write_folder(
     OutputError
         If it cannot be written; nothing is left behind.
     """
-    target = Path(out)
-    made = sections(table, found)
-    document = json.dumps(result_json(table, found), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-    texts = {"result.json": document, "report.html": html(table, found, made)}
-    texts |= {f"figures/{name}.svg": svg for name, svg in page.figures(made).items()}
-    texts["run.json"] = json.dumps(plain(dict(facts or {})), indent=1, allow_nan=False) + "\n"
-    content = result_tables(found)
-    if tables == "csv":
-        texts |= {f"tables/{name}.csv": table_csv(t) for name, t in content.items()}
-    with whole_folder(target, MARK) as folder:
-        for name in ("tables", "figures"):
-            (folder / name).mkdir()
-        for name, text in texts.items():
-            # A label may hold half of a surrogate pair, which no encoding takes.
-            (folder / name).write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
-        if tables == "parquet":
-            for name, t in content.items():
-                _parquet(t, folder / "tables" / f"{name}.parquet")
-    return target
-
-
-def _parquet(table: Table, path: Path) -> None:
-    try:
-        from pyarrow import parquet
-    except ImportError:
-        raise MissingExtra("tables", "--tables parquet") from None
-    parquet.write_table(table.to_arrow(), path)
+    document, content = result_json(table, found), result_tables(found)
+    with language(spoken):
+        made = sections(table, found)
+        contents = Contents(document, html(table, found, made), page.figures(made), content, facts or {})
+    return write(contents, out, MARK, tables)

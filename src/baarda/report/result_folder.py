@@ -2,46 +2,24 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
-import math
-import platform
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import baarda
 from baarda.adjustment import Adjustment
 from baarda.adjustment.parameter_hypotheses import Collinearity
-from baarda.errors import MissingExtra
-from baarda.formats.folder import Mark, whole_folder
-from baarda.formats.project import write as write_project
+from baarda.formats.folder import Mark
 from baarda.hypotheses.base import TestResult
 from baarda.network import Table
 from baarda.observations import Direct, ImageCoordinates, ImagePoints
 from baarda.procedures.testing import Analysis
 from baarda.report.accuracy import accuracy_json
+from baarda.report.contents import Contents, check_tables, plain, software, write
 from baarda.report.laws_json import critical_json, laws_json, study_json
 
 SCHEMA = "baarda.result/1"
 MARK = Mark("result.json", "baarda.result/", ("report.html", "report.pdf", "result.json", "run.json", "tables", "figures", "project"))
-
-
-def plain(value: Any) -> Any:
-    """Return a JSON-compatible value: NumPy numbers as Python ones, NaN and infinity as None."""
-    if isinstance(value, np.ndarray):
-        return [plain(v) for v in value.tolist()]
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value
 
 
 def result_json(analysis: Analysis) -> dict[str, Any]:
@@ -51,7 +29,8 @@ def result_json(analysis: Analysis) -> dict[str, Any]:
     roles = net.points.roles[~a.aside]
     used = o.sigma if analysis.converged else "apriori"
     table = a.unknown_table(o.sigma)
-    camera = [row for row in table.rows() if row["group"] == "camera"]
+    kinds = {"camera"} | {d.kind for d in net.declared if d.removable().any()}  # a radar track is oriented by its parameters, too
+    camera = [row for row in table.rows() if row["group"] in kinds]
     fixed = [
         {
             "name": f"camera {c.label}: {n}",
@@ -114,13 +93,7 @@ def result_json(analysis: Analysis) -> dict[str, Any]:
         "check_points": _check_points(analysis) if analysis.converged else [],
         "accuracy": accuracy_json(analysis),
         "rms": _rms(a) | {"check_intervals": _intervals(analysis)},
-        "software": {
-            "name": "baarda",
-            "version": baarda.__version__,
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "scipy": _scipy_version(),
-        },
+        "software": software(),
     }
     return dict(plain(document))
 
@@ -151,12 +124,6 @@ def _collinearity(c: Collinearity | None) -> dict[str, Any]:
         for n, v, m, (other, rho) in zip(c.names, c.inflation.tolist(), mutual, c.partners, strict=True)
     ]
     return {"variance_inflation": rows, "condition_indices": [] if c.conditions is None else c.conditions.indices}
-
-
-def _scipy_version() -> str:
-    import scipy
-
-    return str(scipy.__version__)
 
 
 def _test(t: TestResult) -> dict[str, Any]:
@@ -252,22 +219,6 @@ def _root(values: Any) -> float | None:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
 
-def table_csv(table: Table) -> str:
-    """Return a table as CSV; numbers read back exactly, not-a-number is empty."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(table.columns)
-    columns = [_cells(c) for c in table.columns.values()]
-    writer.writerows(zip(*columns, strict=True))
-    return out.getvalue()
-
-
-def _cells(column: np.ndarray[Any, Any]) -> list[str]:
-    if column.dtype.kind == "f":
-        return ["" if v != v or v in (math.inf, -math.inf) else repr(v) for v in column.tolist()]
-    return [str(v) for v in column.tolist()]
-
-
 def write_folder(
     analysis: Analysis,
     out: str | Path,
@@ -299,6 +250,8 @@ def write_folder(
 
     Raises
     ------
+    MissingExtra
+        If Parquet or PDF is asked for without its extra.
     OutputError
         If it cannot be written; nothing is left behind.
     """
@@ -306,7 +259,7 @@ def write_folder(
     from baarda.report.pdf import pdf as typeset
     from baarda.report.translation import language
 
-    target = Path(out)
+    check_tables(tables)
     a, o = analysis.adjustment, analysis.options
     content = {
         "observations": observation_table(analysis),
@@ -314,37 +267,8 @@ def write_folder(
         "images": a.image_table(o.sigma),
         "unknowns": a.unknown_table(o.sigma),
     }
-    document = json.dumps(result_json(analysis), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
     with language(spoken):
         sections = page.sections(analysis)
         html, figures = page.html(analysis, sections), page.figures(sections)
-        printed = typeset(analysis, sections) if pdf else None
-    with whole_folder(target, MARK) as folder:
-        _write(folder / "result.json", document)
-        _write(folder / "report.html", html)
-        if printed is not None:
-            (folder / "report.pdf").write_bytes(printed)
-        (folder / "tables").mkdir()
-        for name, table in content.items():
-            if tables == "parquet":
-                _parquet(table, folder / "tables" / f"{name}.parquet")
-            else:
-                _write(folder / "tables" / f"{name}.csv", table_csv(table))
-        (folder / "figures").mkdir()
-        for name, svg in figures.items():
-            _write(folder / "figures" / f"{name}.svg", svg)
-        write_project(a.network, folder / "project")
-        _write(folder / "run.json", json.dumps(plain(run or {}), indent=1, allow_nan=False) + "\n")
-    return target
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8", newline="\n")
-
-
-def _parquet(table: Table, path: Path) -> None:
-    try:
-        from pyarrow import parquet  # type: ignore[import-untyped, import-not-found, unused-ignore]
-    except ImportError:
-        raise MissingExtra("tables", "--tables parquet") from None
-    parquet.write_table(table.to_arrow(), path)
+        files = {"report.pdf": typeset(analysis, sections)} if pdf else {}
+    return write(Contents(result_json(analysis), html, figures, content, run or {}, files, a.network), out, MARK, tables)

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-import json
-import platform
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import baarda
 from baarda.discover import members
-from baarda.formats.folder import Mark, whole_folder
-from baarda.formats.project import write as write_project
+from baarda.formats.folder import Mark
 from baarda.network import Table
+from baarda.observations import component_unit
 from baarda.procedures.planning import Planned
 from baarda.procedures.proof import LIMIT, Proof, RateProof, SigmaProof
 from baarda.procedures.testing import Analysis
 from baarda.report import page
-from baarda.report.result_folder import plain, table_csv
+from baarda.report.contents import Contents, plain, software, write
 from baarda.report.sections._numbers import fixed, probability, significant
-from baarda.report.sections.base import Block, Cell, Column, DataTable, Paragraph, Section, SectionMaker, Tone, Verdict, say
+from baarda.report.sections.base import Block, Cell, Column, DataTable, Paragraph, Section, SectionMaker, Tone, Verdict, say, translated
 from baarda.report.simulation_verdict import largest, median, prediction, sentences
+from baarda.report.translation import language, tr
 
 SCHEMA = "baarda.simulation/1"
 MARK = Mark("result.json", "baarda.simulation/", ("report.html", "result.json", "run.json", "tables", "figures", "project"))
@@ -61,7 +59,7 @@ def sections(planned: Planned, proof: Proof | None) -> list[Section]:
     made.append(Section("reliability", "Reliability of the observations", tuple(_reliability(planned))))
     makers = [m for m in members("baarda.report.sections", SectionMaker) if isinstance(m, SectionMaker) and m.id in _SHARED]
     shared = (m.make(analysis) for m in sorted(makers, key=lambda m: m.order))
-    return made + [s for s in shared if s is not None]
+    return [*(translated(s) for s in made), *(s for s in shared if s is not None)]
 
 
 def _apriori(planned: Planned) -> Any:
@@ -78,10 +76,12 @@ def _reliability(planned: Planned) -> list[Block]:
         r, bias, external = a.redundancy_numbers[at], table["mdb"][at], table["external"][at]
         free = int((~planned.controlled[at]).sum())
         ratio = bias / a.sigmas[at]
+        units = dict.fromkeys(component_unit(group, c) for c in range(len(group.components)))
         rows.append(
             (
                 group.name,
                 str(len(r)),
+                ", ".join(units),
                 fixed(float(r.mean()), 3),
                 fixed(float(r.min()), 3),
                 str(free),
@@ -95,6 +95,7 @@ def _reliability(planned: Planned) -> list[Block]:
     columns = (
         Column("group", "", "", "left"),
         Column("n", "", "number of observations"),
+        Column("unit", "", "of the MDB", "left"),
         Column("mean r", "", "mean redundancy number: share of an error that shows in the residuals"),
         Column("least r", "", "least redundancy number"),
         Column("uncontrolled", "", "observations that no other controls"),
@@ -147,12 +148,16 @@ def _decision(holds: bool, told: bool = True) -> Cell:
 def _sigma_table(p: Proof) -> DataTable:
     rows: list[tuple[str | Cell, ...]] = []
     for s in (*p.sigmas, p.residuals):
-        rows.append((s.name, str(s.count), significant(s.predicted), fixed(s.ratio, 3), f"{fixed(s.low, 3)}..{fixed(s.high, 3)}"))
+        rows.append((tr(s.name), str(s.count), significant(s.predicted), fixed(s.ratio, 3), f"{fixed(s.low, 3)}..{fixed(s.high, 3)}"))
         rows[-1] += (fixed(s.z, 1), _decision(s.holds))
     columns = (
         Column("of", "", "", "left"),
         Column("unknowns", "", "number of unknowns in the group"),
-        Column("predicted sigma", "", "median of the predicted standard deviations, a priori; angles in radians"),
+        Column(
+            "predicted sigma",
+            "",
+            "median of the predicted standard deviations, a priori, in the unit of the object space; angles in radians",
+        ),
         Column(
             "sampled / predicted", "", "root mean square of the errors of all replicas, each divided by its predicted standard deviation"
         ),
@@ -178,7 +183,8 @@ def _rate_table(caption: str, proofs: tuple[RateProof, ...], note: str = "") -> 
     rows: list[tuple[str | Cell, ...]] = []
     for r in proofs:
         interval = f"{fixed(100 * r.low, 2)}..{fixed(100 * r.high, 2)}"
-        rows.append((r.name, significant(r.members), fixed(100 * r.expected, 2), fixed(100 * r.rate, 2), interval, fixed(r.z, 1)))
+        members = str(round(r.members)) if float(r.members).is_integer() else significant(r.members)
+        rows.append((r.name.replace("_", " "), members, fixed(100 * r.expected, 2), fixed(100 * r.rate, 2), interval, fixed(r.z, 1)))
         rows[-1] += (_decision(r.holds, r.told),)
     columns = (
         Column("test", "", "", "left"),
@@ -216,8 +222,6 @@ def result_json(planned: Planned, proof: Proof | None = None) -> dict[str, Any]:
     dict
         JSON-compatible; numbers that do not exist are None.
     """
-    import scipy
-
     a, o = planned.adjustment, planned.options
     document = {
         "schema": SCHEMA,
@@ -238,13 +242,7 @@ def result_json(planned: Planned, proof: Proof | None = None) -> dict[str, Any]:
         "unknowns": [row for row in a.unknown_table("apriori").rows() if row["group"] == "camera"],
         "proof": None if proof is None else _proof_json(proof),
         "verdict": verdict(planned, proof),
-        "software": {
-            "name": "baarda",
-            "version": baarda.__version__,
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "scipy": str(scipy.__version__),
-        },
+        "software": software(),
     }
     return dict(plain(document))
 
@@ -299,7 +297,12 @@ def tables(planned: Planned, proof: Proof | None = None) -> dict[str, Table]:
 
 
 def write_folder(
-    planned: Planned, proof: Proof | None, out: str | Path, table_format: str = "csv", facts: Mapping[str, Any] | None = None
+    planned: Planned,
+    proof: Proof | None,
+    out: str | Path,
+    table_format: str = "csv",
+    facts: Mapping[str, Any] | None = None,
+    spoken: str = "en",
 ) -> Path:
     """Write the result folder.
 
@@ -312,6 +315,8 @@ def write_folder(
     table_format : {"csv", "parquet"}
     facts : mapping, optional
         For `run.json`.
+    spoken : str
+        Language of the report; JSON and tables are English.
 
     Returns
     -------
@@ -324,32 +329,34 @@ def write_folder(
     OutputError
         If it cannot be written; nothing is left behind.
     """
-    from baarda.report.result_folder import _parquet
+    document, content = result_json(planned, proof), tables(planned, proof)
+    with language(spoken):
+        made = sections(planned, proof)
+        contents = Contents(
+            document, html(planned, proof, made), page.figures(made), content, facts or {}, network=planned.adjustment.network
+        )
+    return write(contents, out, MARK, table_format)
 
-    target, a = Path(out), planned.adjustment
-    made = sections(planned, proof)
+
+def html(planned: Planned, proof: Proof | None, made: list[Section]) -> str:
+    """Return the report as one page.
+
+    Parameters
+    ----------
+    planned : Planned
+    proof : Proof or None
+    made : list of Section
+        See `sections`.
+
+    Returns
+    -------
+    str
+    """
+    a = planned.adjustment
     tones: list[Tone] = [s.tone for s in sentences(planned, proof)]
     bad, warn = tones.count("bad"), tones.count("warn")
     whole = ("bad", "Predictions do not hold") if bad else ("warn", "The network needs attention") if warn else ("good", "Nothing objects")
-    facts_told = [("images", str(len(a.network.images.labels))), ("observations n", str(a.count)), ("unknowns u", str(a.numbering.count))]
-    facts_told += [("redundancy r", str(a.redundancy)), ("replicas", str(proof.replicas.count) if proof else "none")]
-    name = a.network.name or a.network.path or "network in memory"
-    texts = {
-        "result.json": json.dumps(result_json(planned, proof), indent=1, allow_nan=False, ensure_ascii=False) + "\n",
-        "report.html": page.render("Simulation report", name, "predicted" if proof is None else "proven", whole, facts_told, made),
-        "run.json": json.dumps(plain(dict(facts or {})), indent=1, allow_nan=False) + "\n",
-        **{f"figures/{n}.svg": svg for n, svg in page.figures(made).items()},
-    }
-    content = tables(planned, proof)
-    if table_format == "csv":
-        texts |= {f"tables/{n}.csv": table_csv(t) for n, t in content.items()}
-    with whole_folder(target, MARK) as folder:
-        for n in ("tables", "figures"):
-            (folder / n).mkdir()
-        for n, text in texts.items():
-            (folder / n).write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
-        if table_format == "parquet":
-            for n, t in content.items():
-                _parquet(t, folder / "tables" / f"{n}.parquet")
-        write_project(a.network, folder / "project")
-    return target
+    told = [("images", str(len(a.network.images.labels))), ("observations n", str(a.count)), ("unknowns u", str(a.numbering.count))]
+    told += [("redundancy r", str(a.redundancy)), ("replicas", str(proof.replicas.count) if proof else tr("none"))]
+    name = a.network.name or a.network.path or tr("network in memory")
+    return page.render("Simulation report", name, "predicted" if proof is None else "proven", (whole[0], tr(whole[1])), told, made)
