@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from baarda.errors import RedundancyNotPositive, UsageError
-from baarda.hypotheses import _linear_model, _simulation, homogeneity, moments, variance_factor
+from baarda.hypotheses import _linear_model, _simulation, goodness_of_fit, homogeneity, moments, run, variance_factor
 from baarda.hypotheses.base import Evidence, SimulatedLaw
 from baarda.hypotheses.levels import Options
 
@@ -169,12 +169,32 @@ def test_too_many_observations_to_simulate() -> None:
 
 def test_simulated_law_does_not_depend_on_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     e = network(4)
-    whole = _simulation.simulate(e, lambda v: v.max(axis=0), Options(replicas=50))
+    whole = _simulation.simulate(e, "largest", lambda v: v.max(axis=0), Options(replicas=50))
     monkeypatch.setattr(_simulation, "_CHUNK", 7 * len(e.residuals))
-    parts = _simulation.simulate(e, lambda v: v.max(axis=0), Options(replicas=50))
+    parts = _simulation.simulate(e, "largest", lambda v: v.max(axis=0), Options(replicas=50))
     assert whole is not None
     assert parts is not None
     np.testing.assert_allclose(whole, parts, rtol=1e-12)
+
+
+def test_all_tests_share_one_pass_of_simulated_data_sets() -> None:
+    """Each replica goes through the adjustment once, and every test finds the law that it finds alone."""
+    e, o = network(4), Options(replicas=99)
+    columns: list[int] = []
+
+    def counted(errors: np.ndarray) -> np.ndarray:
+        columns.append(errors.shape[1])
+        assert e.residuals_of is not None
+        return e.residuals_of(errors)
+
+    together = run(Evidence(**{**vars(e), "residuals_of": counted}), o)
+    assert columns.count(99) == 1
+    laws = {t.name: t.law.values for t in together if isinstance(t.law, SimulatedLaw)}
+    alone = [*moments.from_evidence(e, o), *homogeneity.from_evidence(e, o), *goodness_of_fit.from_evidence(e, o)]
+    found = {t.name: t.law.values for t in alone if isinstance(t.law, SimulatedLaw)}
+    assert found.keys() == laws.keys() >= {"skewness_of_residuals", "kurtosis_of_residuals", "bartlett_images", "goodness_of_fit"}
+    for name, values in found.items():
+        np.testing.assert_allclose(laws[name], values, rtol=1e-12)
 
 
 def test_kurtosis_of_residuals_is_nearer_to_normal_than_that_of_errors() -> None:

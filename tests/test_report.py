@@ -403,3 +403,112 @@ def test_colours_have_the_contrast_that_reading_needs(scheme, calibration):
         assert contrast(tone, f"{tone}-paper") >= 4.5, tone
     for line in ("blue", "orange", "green"):
         assert contrast(line, "paper") >= 3.0, line
+
+
+# ---- what a surveyor asks for ----------------------------------------------------------------------------------------------------------
+
+
+def section(analysis, name):
+    return next(s for s in page.sections(analysis) if s.id == name)
+
+
+def test_iterations_are_a_figure(calibration):
+    (figure,) = [b for b in section(calibration, "data").blocks if isinstance(b, Figure)]
+    history = calibration.adjustment.history
+    assert figure.name == "iterations" and "v'Pv falls from" in figure.caption
+    assert f"in {len(history) - 1} iteration" in figure.caption
+    assert ("Damped:" in figure.caption) == any(h.damping > 0.0 for h in history)
+    assert ("refused" in figure.caption) == any(not h.accepted for h in history)
+    assert "mathdefault" not in figure.svg and "1e-" in figure.svg
+    assert figure.svg.count("relative step") == 1 and len(figure.alt) > len(figure.caption)
+
+
+def test_expanded_uncertainties_state_their_factors(aerial):
+    """The factors by the quantiles of t and F; the largest coordinate by its own standard deviation."""
+    from scipy import stats
+
+    table = next(b for b in section(aerial, "points").blocks if isinstance(b, DataTable) and b.caption.startswith("Expanded"))
+    rows = {r[0]: r for r in table.rows}
+    r = aerial.adjustment.redundancy
+    assert rows["X"][1:3] == (f"{stats.t(r).ppf(0.975):.3f}", f"t({r})")
+    assert rows["horizontal"][1] == f"{np.sqrt(2 * stats.f(2, r).ppf(0.95)):.3f}"
+    assert rows["in space"][1] == f"{np.sqrt(3 * stats.f(3, r).ppf(0.95)):.3f}"
+    points = aerial.adjustment.point_table("aposteriori")
+    assert float(rows["Z"][4]) == pytest.approx(stats.t(r).ppf(0.975) * points["sZ"].max(), rel=2e-2)
+    assert float(rows["horizontal"][4]) == pytest.approx(points["ellipse_a"].max(), rel=2e-2)
+    apriori = analyse(baarda.adjust(ring(control=4)), Options(sigma="apriori"))
+    table = next(b for b in section(apriori, "points").blocks if isinstance(b, DataTable) and b.caption.startswith("Expanded"))
+    assert [row[1] for row in table.rows] == ["1.960", "1.960", "1.960", "2.448", "2.795"]
+
+
+def test_two_values_of_a_are_explained(calibration):
+    words = page.text([section(calibration, "law")])
+    a = calibration.study.laws.modulated.parameters["a"]
+    b = calibration.study.critical.law.parameters["a"]
+    assert abs(a - b) > 0.01  # they do differ here
+    said = " ".join(words.split())
+    assert f"a = {a:.2f} is the law of the residuals" in said and f"a = {b:.2f} is the law of the errors" in said
+    assert "listens to the tails" in said
+
+
+def test_audit_speaks_in_the_verdict():
+    from baarda.procedures.audit import audit
+
+    network = ring(control=5, checks=3)
+    solved = baarda.adjust(network).network
+    for source, tone, words in (
+        (solved, "good", "within what the observations can tell"),
+        (network, "bad", "not the least-squares solution"),
+    ):
+        audited = audit(source, Options())
+        analysis = replace(analyse(audited.adjustment), audit=audited)
+        made = section(analysis, "verdict").blocks[0].sentences
+        assert 5 <= len(made) <= 8
+        assert made[0].subject == "Audit" and made[0].tone == tone and words in made[0].text and made[0].link == "audit"
+
+
+def test_far_points_do_not_make_the_plan_small():
+    rng = np.random.default_rng(2)
+    cloud = rng.uniform(0.0, 10.0, (400, 3))
+    low, high = plots.core_of(cloud, np.array([[5.0, 5.0, 30.0]]))
+    np.testing.assert_allclose(low, cloud.min(axis=0))
+    np.testing.assert_allclose(high, [*cloud.max(axis=0)[:2], 30.0])
+    far = np.concatenate([cloud, [[900.0, 5.0, 5.0], [5.0, -700.0, 5.0]]])
+    low, high = plots.core_of(far, np.array([[5.0, 5.0, 30.0]]))
+    assert high[0] < 20.0 and low[1] > -10.0 and high[2] == 30.0
+
+
+def test_text_and_json_hold_what_the_page_holds(aerial):
+    """The same sections as text; every number of the verdict from the same analysis as the JSON."""
+    from baarda.report.result_folder import result_json
+
+    document = result_json(aerial)
+    said = page.verdict(aerial)
+    assert f"{document['counts']['observations']} observations" in said[0]
+    assert f"{document['sigma0']['aposteriori'] ** 2:.3f}" in said[1]
+    words = page.text(page.sections(aerial))
+    assert all(" ".join(s.split()[:6]) in " ".join(words.split()) for s in said)
+
+
+def test_plan_of_many_points_draws_a_sample_and_says_so(aerial, monkeypatch):
+    from baarda.report.sections import plan
+
+    tie = np.arange(500_000) % 1000 != 0
+    rows = plan._sample(tie)
+    assert len(rows) == plan.MOST_POINTS and set(np.flatnonzero(~tie)) <= set(rows.tolist()) and (np.diff(rows) > 0).all()
+    assert "are drawn" not in section(aerial, "network-plan").blocks[0].caption
+    monkeypatch.setattr(plan, "MOST_POINTS", 100)
+    made = section(aerial, "network-plan").blocks[0]
+    assert "Only 100 points are drawn: those of the survey and an even sample of the others." in made.caption
+
+
+def test_rows_by_unit_are_those_of_each_row(aerial):
+    from baarda.report.sections._facts import rows_by_unit, unit_of
+
+    rows = np.arange(aerial.adjustment.count)
+    parts = rows_by_unit(aerial, rows)
+    assert sorted(np.concatenate(list(parts.values())).tolist()) == rows.tolist()
+    first = [int(at[0]) for at in parts.values()]
+    assert first == sorted(first)
+    for unit, at in parts.items():
+        assert all(unit_of(aerial, int(i)) == unit for i in at[:: max(1, len(at) // 20)])

@@ -14,19 +14,23 @@ from baarda.cli.base import (
     AuditFlag,
     CameraList,
     CameraPositionsFile,
+    Cluster,
     Components,
     ComponentsBy,
     Control,
     Covariance,
     CriterionB,
     CrossValidate,
+    Crs,
     DatumName,
     FormatName,
+    GeoidHeight,
     ImageSigma,
     Jobs,
     Json,
     Language,
     LeverArm,
+    MarksFile,
     MinRays,
     Out,
     Pdf,
@@ -60,6 +64,9 @@ def adjust(
     out: Out = None,
     format: FormatName = None,
     control: Control = None,
+    marks: MarksFile = None,
+    crs: Crs = None,
+    geoid: GeoidHeight = None,
     camera_positions: CameraPositionsFile = None,
     lever_arm: LeverArm = "0,0,0",
     position_model: PositionModel = "none",
@@ -86,6 +93,7 @@ def adjust(
     sigma: SigmaName = "aposteriori",
     seed: Seed = 0,
     jobs: Jobs = None,
+    cluster: Cluster = None,
     tables: Tables = "csv",
     spoken: Language = "en",
     pdf: Pdf = False,
@@ -99,11 +107,57 @@ def adjust(
     from baarda.formats import read
 
     started = time.perf_counter()
-    network = read(source, format=format, control=control)
+    if cluster is not None or (source.name == "partition.json" or (source / "partition.json").is_file()):
+        from baarda.cli.run_parts import adjust_parts_and_report
+
+        adjust_parts_and_report(
+            source,
+            {"datum": datum, "image_sigma": image_sigma, "residual_plane": residual_plane, "min_rays": min_rays, "jobs": jobs},
+            {"alpha": alpha, "alpha_outlier": alpha_outlier, "power": power, "sigma": sigma, "seed": seed},
+            None if as_json and out is None else out or Path("baarda-out"),
+            tables,
+            as_json,
+            quiet,
+            strict,
+            started,
+            cluster,
+            spoken,
+            {
+                "--format": format,
+                "--control": control,
+                "--marks": marks,
+                "--crs": crs,
+                "--camera-positions": camera_positions,
+                "--camera": camera != "source",
+                "--solver": solver == "dense",
+                "--robust": robust,
+                "--audit": audit,
+                "--snoop": snoop or snoop_law,
+                "--select": select,
+                "--cross-validate": cross_validate,
+                "--strategy": strategy,
+                "--variance-components": variance_components,
+                "--pdf": pdf,
+                "--covariance": covariance,
+                "--points": points,
+            },
+        )
+        return
+    system = None
+    if crs is not None:
+        from baarda.formats.coordinate_system import CoordinateSystem
+
+        if control is None and camera_positions is None:
+            raise UsageError("--crs names the coordinate system of --control or --camera-positions")
+        system = CoordinateSystem.of(crs, geoid)
+    elif geoid is not None:
+        raise UsageError("--geoid belongs to --crs")
+    tied = {} if control is None else {"crs": crs, "geoid": geoid}
+    network = read(source, format=format, control=control, marks=marks, **tied)
     if camera_positions is not None:
         from baarda.formats.camera_positions import with_camera_positions
 
-        network = with_camera_positions(network, camera_positions, lever_arm, position_model)
+        network = with_camera_positions(network, camera_positions, lever_arm, position_model, system)
     elif lever_arm != "0,0,0" or position_model != "none":
         raise UsageError("--lever-arm and --position-model belong to --camera-positions")
     settings = {

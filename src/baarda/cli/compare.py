@@ -15,6 +15,7 @@ from baarda.cli.base import (
     Control,
     ImageSigma,
     Json,
+    Language,
     MinRays,
     Out,
     Quiet,
@@ -48,22 +49,24 @@ def compare(
     alpha: Alpha = 0.05,
     sigma: SigmaName = "aposteriori",
     tables: Tables = "csv",
+    language: Language = "en",
     as_json: Json = False,
     quiet: Quiet = False,
     strict: Strict = False,
 ) -> None:
     """Compare two adjustments of the same points: variance ratio, congruence, and which points have moved."""
     from baarda.cli.adjust import camera_list
-    from baarda.errors import UsageError
     from baarda.formats.folder import check_target
     from baarda.hypotheses.levels import Options
     from baarda.procedures.comparison import compare as compare_epochs
     from baarda.procedures.comparison import epoch
+    from baarda.report import translation
     from baarda.report.comparison_report import MARK, result_json, verdict, write_folder
+    from baarda.report.contents import check_tables
 
     started = time.perf_counter()
-    if tables not in ("csv", "parquet"):
-        raise UsageError(f"--tables is csv or parquet, not {tables!r}")
+    check_tables(tables)
+    translation.check_language(language)
     target = None if as_json and out is None else out or Path("baarda-comparison")
     if target is not None:
         check_target(target, MARK)
@@ -78,12 +81,13 @@ def compare(
     chosen = None if points is None else [p.strip() for p in points.split(",") if p.strip()]
     made = compare_epochs(epochs[0], epochs[1], options, frame, chosen)  # type: ignore[arg-type]
     if target is not None:
-        write_folder(made, target, tables, {"seconds": round(time.perf_counter() - started, 3)})
+        write_folder(made, target, tables, {"seconds": round(time.perf_counter() - started, 3)}, language)
     if as_json:
         typer.echo(json.dumps(result_json(made), indent=1, allow_nan=False, ensure_ascii=False))
     elif not quiet:
-        for sentence in verdict(made):
-            typer.echo(sentence)
+        with translation.language(language):
+            for sentence in verdict(made):
+                typer.echo(sentence)
     if target is not None and not quiet:
         typer.echo(f"report: {target / 'report.html'}", err=True)
     if strict and made.rejected:

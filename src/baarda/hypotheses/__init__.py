@@ -38,7 +38,8 @@ def run(evidence: Evidence, options: Options | None = None) -> list[TestResult]:
     Returns
     -------
     list of TestResult
-        The tests whose fields are present. A member states its place by a module constant ``ORDER``.
+        The tests whose fields are present. A member states its place by a module constant ``ORDER``; one that simulates its null law may
+        define ``simulated_statistic(evidence, options)``, a function of residuals: all of these are computed from the same replicas.
 
     Notes
     -----
@@ -52,12 +53,21 @@ def run(evidence: Evidence, options: Options | None = None) -> list[TestResult]:
     >>> [t.name for t in run(Evidence(residuals=v, sigmas=np.ones(8), vpv=float(v @ v), redundancy=7))][:2]
     ['global_variance_factor', 'mean_of_residuals']
     """
+    from dataclasses import replace
+
     from baarda.discover import modules
+    from baarda.hypotheses._simulation import simulate_all
     from baarda.hypotheses.levels import Options
 
     chosen = Options() if options is None else options
     members = [m for m in modules(__name__) if hasattr(m, "from_evidence")]
     ordered = sorted(members, key=lambda m: (getattr(m, "ORDER", 1000), m.__name__))
+    if evidence.residuals_of is not None and not evidence.simulated:
+        wanted = {
+            m.__name__.rpartition(".")[2]: m.simulated_statistic(evidence, chosen) for m in ordered if hasattr(m, "simulated_statistic")
+        }
+        shared = simulate_all(evidence, {name: s for name, s in wanted.items() if s is not None}, chosen)
+        evidence = replace(evidence, simulated=shared)
     return [result for member in ordered for result in member.from_evidence(evidence, chosen)]
 
 

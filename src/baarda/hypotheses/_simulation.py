@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,18 +44,28 @@ def affordable(evidence: Evidence, options: Options) -> int:
     return count if count >= min(_FEWEST, options.replicas) else 0
 
 
-def simulate(evidence: Evidence, statistic: Callable[[Floats], Floats], options: Options) -> Floats | None:
+def simulate(evidence: Evidence, name: str, statistic: Callable[[Floats], Floats], options: Options) -> Floats | None:
     """Return the statistics of simulated data sets, (B, ...), or None where the null cannot be simulated or is not affordable.
 
-    `statistic` maps residuals in units of the a-priori sigma, (n, b), to (b, ...). Replica k uses child k of the seed, so that the
-    result does not depend on the chunks.
+    `statistic` maps residuals in units of the a-priori sigma, (n, b), to (b, ...). Where one pass has computed them for all tests, they are
+    taken from there by the name of the test.
+    """
+    found = evidence.simulated.get(name)
+    return simulate_all(evidence, {name: statistic}, options).get(name) if found is None else found
+
+
+def simulate_all(evidence: Evidence, statistics: Mapping[str, Callable[[Floats], Floats]], options: Options) -> dict[str, Floats]:
+    """Return several statistics of the same simulated data sets by name; nothing where the null cannot be simulated or is not affordable.
+
+    Replica k uses child k of the seed, so that the result does not depend on the chunks. Leading residuals through the adjustment costs
+    far more than the statistics do: all tests that simulate share one pass.
     """
     count, n = affordable(evidence, options), len(evidence.residuals)
-    if count == 0 or evidence.residuals_of is None:
-        return None
+    if count == 0 or evidence.residuals_of is None or not statistics:
+        return {}
     children = np.random.SeedSequence(options.seed).spawn(count)
     width = max(1, int(_CHUNK // max(n, 1)))
-    parts = []
+    parts: dict[str, list[Floats]] = {name: [] for name in statistics}
     for start in range(0, count, width):
         chunk = children[start : start + width]
         errors = np.empty((n, len(chunk)))
@@ -64,8 +74,9 @@ def simulate(evidence: Evidence, statistic: Callable[[Floats], Floats], options:
         residuals = np.asarray(evidence.residuals_of(errors), dtype=float)
         if residuals.shape != errors.shape:
             raise UsageError(f"residuals_of maps {errors.shape} to {residuals.shape}; it must keep the shape")
-        parts.append(statistic(residuals))
-    return np.concatenate(parts)
+        for name, statistic in statistics.items():
+            parts[name].append(statistic(residuals))
+    return {name: np.concatenate(found) for name, found in parts.items()}
 
 
 def null_note(evidence: Evidence, options: Options, count: int) -> str:

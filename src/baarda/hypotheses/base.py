@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -112,7 +113,7 @@ class TestResult:
     note: str = ""
     details: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def p_value(self) -> Any:
         """Probability under the null hypothesis of a statistic at least as extreme; same shape as `statistic`."""
         if self.tail == "right":
@@ -132,7 +133,7 @@ class TestResult:
             return float(self.law.ppf(self.alpha))
         return float(self.law.ppf(self.alpha / 2.0)), float(self.law.ppf(1.0 - self.alpha / 2.0))
 
-    @property
+    @cached_property
     def rejected(self) -> Any:
         """Whether the null hypothesis is rejected at level `alpha`; same shape as `statistic`."""
         r = np.asarray(self.p_value) <= self.alpha * (1.0 + 1e-12)  # a p-value equal to the level rejects: exact for simulated laws
@@ -202,6 +203,8 @@ class Evidence:
     residuals_of : callable or None
         Maps standardised errors (n, B), independent with unit variance, to the standardised residuals -Qvv P e scaled by 1/sigma of
         each observation, (n, B), so that every simulated null needs no n x n array.
+    simulated : mapping of str to (B, ...) array
+        Statistics of simulated data sets by test, where one pass computed them for all tests, see `baarda.hypotheses.run`.
     """
 
     residuals: Floats
@@ -227,6 +230,7 @@ class Evidence:
     check: Estimates | None = None
     control: Estimates | None = None
     residuals_of: Callable[[Floats], Floats] | None = None
+    simulated: Mapping[str, Floats] = field(default_factory=dict)
 
     @property
     def variance_factor(self) -> float:

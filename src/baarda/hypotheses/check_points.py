@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -185,6 +186,6 @@ def from_evidence(evidence: Evidence, options: Options) -> list[TestResult]:
     joint = check_points(e.values, e.cofactors, factor0, r, e.reference_covariance, options.global_level(len(e.values)), e.names)
     if count < 3:
         few = f"Only {count} check point{'s' if count > 1 else ''}: little evidence about the whole block. "
-        joint = TestResult(**{**vars(joint), "note": (few + joint.note).strip()})
+        joint = replace(joint, note=(few + joint.note).strip())
     level = options.global_level(max(groups.count(g) for g in set(groups)))
     return [joint, check_point(e.values, e.cofactors, factor0, r, groups, e.reference_covariance, level, options.levels)]

@@ -26,7 +26,7 @@ from baarda.distributions.replicas import both_areas, profile_columns, refit_col
 from baarda.distributions.result import Fit
 from baarda.distributions.sample import check_values
 from baarda.errors import UsageError
-from baarda.hypotheses._simulation import affordable, controlled, shares, skipped_note
+from baarda.hypotheses._simulation import controlled, shares, simulate, skipped_note
 from baarda.hypotheses.base import Evidence, Floats, SimulatedLaw, TestResult
 from baarda.hypotheses.levels import Options, check_level
 
@@ -465,27 +465,31 @@ def _note(residuals_of: ResidualsOf | None, found: Fit, seed: int) -> str:
     return f"Parametric bootstrap through the design matrix, seed {seed}: {kind}."
 
 
+def simulated_statistic(evidence: Evidence, options: Options) -> Callable[[Floats], Floats] | None:
+    """Return the statistic that is simulated: Anderson-Darling's, on residuals divided by their own standard deviations."""
+    seen = controlled(evidence)
+    if seen.sum() < 8 or evidence.vpv <= 0.0:
+        return None
+    own = np.sqrt(shares(evidence)[seen])[:, None]
+    return lambda v: _normal_statistic(v[seen] / own)
+
+
 def from_evidence(evidence: Evidence, options: Options) -> list[TestResult]:
     """Return the Anderson-Darling test of normal errors on residuals standardised by their own sigma."""
-    seen = controlled(evidence)
-    replicas = affordable(evidence, options)
-    if replicas == 0 or evidence.residuals_of is None or seen.sum() < 8 or evidence.vpv <= 0.0:
+    seen, statistic = controlled(evidence), simulated_statistic(evidence, options)
+    if statistic is None or np.ptp((x := evidence.residuals / evidence.sigmas)[seen] / np.sqrt(shares(evidence)[seen])) == 0.0:
         return []
-    own = np.sqrt(shares(evidence)[seen])[:, None]
-    x = (evidence.residuals / evidence.sigmas)[seen, None] / own
-    if np.ptp(x) == 0.0:
+    null = simulate(evidence, "goodness_of_fit", statistic, options)
+    if null is None:
         return []
-    parts = [
-        _normal_statistic(np.asarray(evidence.residuals_of(z))[seen] / own)
-        for z in _draws(find_law("normal")(), seen.size, replicas, options.seed)
-    ]
+    replicas = len(null)
     fewer = f" (fewer than {options.replicas}: {seen.size} observations)" if replicas < options.replicas else ""
     return [
         TestResult(
             "goodness_of_fit",
             "The errors of the observations are normal.",
-            float(_normal_statistic(x)[0]),
-            SimulatedLaw(np.sort(np.concatenate(parts))),
+            float(statistic(x[:, None])[0]),
+            SimulatedLaw(np.sort(null)),
             f"simulated, B = {replicas}",
             options.global_level(1),
             note=f"Anderson-Darling on {int(seen.sum())} residuals, each divided by its own standard deviation; null law by {replicas} "

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -208,13 +208,19 @@ def _group(images: NDArray[np.intp], weights: Floats) -> tuple[_Grouping, int]:
     return _Grouping(rows, starts, df[kept], codes), int((~kept).sum())
 
 
-def from_evidence(evidence: Evidence, options: Options) -> list[TestResult]:
-    """Return Bartlett's test over the images, and each image against the pooled variance.
+@dataclass(frozen=True)
+class _Images:
+    """The images of an adjustment with their sums of squares, and what a reader must know of them."""
 
-    The images of one adjustment share unknowns: their variances are not independent, and the null law is simulated.
-    """
+    groups: _Grouping
+    sums: Floats
+    note: str
+
+
+def _images(evidence: Evidence) -> _Images | None:
+    """Return the images that can be compared; None where there are fewer than two."""
     if evidence.images is None or (evidence.redundancy_numbers is None and evidence.qvv is None):
-        return []
+        return None
     share = shares(evidence)
     v = evidence.residuals / evidence.sigmas
     squares = v * v
@@ -230,17 +236,36 @@ def from_evidence(evidence: Evidence, options: Options) -> list[TestResult]:
     groups, dropped = _group(evidence.images, share)
     sums = groups.sums(squares) if len(groups.df) else np.zeros(0)
     if len(groups.df) < 2 or not (sums > 0.0).all():
-        return []
+        return None
     if dropped:
         note += f" {dropped} images without redundancy are left out."
-    return _over_images(evidence, options, groups, sums, note)
+    return _Images(groups, sums, note)
+
+
+def simulated_statistic(evidence: Evidence, options: Options) -> Callable[[Floats], Floats] | None:
+    """Return the statistic that is simulated: the sum of the squared residuals of each image."""
+    found = _images(evidence)
+    return None if found is None else _sums_of(found.groups)
+
+
+def _sums_of(groups: _Grouping) -> Callable[[Floats], Floats]:
+    return lambda v: groups.sums(v * v).T
+
+
+def from_evidence(evidence: Evidence, options: Options) -> list[TestResult]:
+    """Return Bartlett's test over the images, and each image against the pooled variance.
+
+    The images of one adjustment share unknowns: their variances are not independent, and the null law is simulated.
+    """
+    found = _images(evidence)
+    return [] if found is None else _over_images(evidence, options, found.groups, found.sums, found.note)
 
 
 def _over_images(evidence: Evidence, options: Options, groups: _Grouping, sums: Floats, note: str) -> list[TestResult]:
     df, total, k = groups.df, float(groups.df.sum()), len(groups.df)
     labels = [evidence.image_names[c] if c < len(evidence.image_names) else f"image {c}" for c in groups.codes]
     c = _correction(df)
-    simulated = simulate(evidence, lambda v: groups.sums(v * v).T, options)
+    simulated = simulate(evidence, "homogeneity", _sums_of(groups), options)
     note = null_note(evidence, options, 0 if simulated is None else len(simulated)) + note
     s2 = sums / df
     statistic = df * s2 * total / sums.sum()
@@ -262,5 +287,5 @@ def _over_images(evidence: Evidence, options: Options, groups: _Grouping, sums: 
     second = _per_set(statistic, laws, spoken_each, alpha, options.levels, labels, s2, df, float(sums.sum() / total), note)
     if simulated is not None and second.alpha < 2.0 / (len(simulated) + 1.0):
         more = f" {len(simulated)} replicas cannot reach the level {second.alpha:.2g} of a single image: no image can be rejected."
-        second = TestResult(**{**vars(second), "note": second.note + more})
+        second = replace(second, note=second.note + more)
     return [first, second]

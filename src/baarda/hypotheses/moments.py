@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from baarda.errors import UsageError
@@ -443,31 +443,48 @@ def _cofactor_of_sum(evidence: Evidence) -> float | None:
     return float(-images[:, 0].sum())
 
 
+def _spread(evidence: Evidence, seen: NDArray[np.bool_]) -> Floats:
+    return np.asarray(evidence.sigmas[seen] * np.sqrt(shares(evidence)[seen]))
+
+
+def _values(evidence: Evidence, seen: NDArray[np.bool_]) -> Floats | None:
+    """Return the residuals that are studied, each divided by its own standard deviation; None where they tell nothing."""
+    if evidence.vpv <= 0.0 or seen.sum() < 4:
+        return None
+    x = evidence.residuals[seen] / _spread(evidence, seen) * (evidence.sigma0_apriori / evidence.sigma0)
+    return None if np.ptp(x) == 0.0 else x
+
+
+def simulated_statistic(evidence: Evidence, options: Options) -> Callable[[Floats], Floats] | None:
+    """Return the statistic that is simulated: three moments, the sum of the residuals, and that of their squares."""
+    seen = controlled(evidence)
+    if _values(evidence, seen) is None:
+        return None
+    factor = (evidence.sigmas[seen] / _spread(evidence, seen))[:, None]
+    return lambda v: np.column_stack([_moments(v[seen] * factor), v.sum(axis=0), (v * v).sum(axis=0)])
+
+
 def from_evidence(evidence: Evidence, options: Options) -> list[TestResult]:
     """Return the tests of mean, skewness, kurtosis, and of the last two together (Jarque-Bera), on standardised residuals."""
     from baarda.hypotheses.normality import jarque_bera
 
     seen = controlled(evidence)
-    if evidence.vpv <= 0.0 or seen.sum() < 4:
+    x, statistic = _values(evidence, seen), simulated_statistic(evidence, options)
+    if x is None or statistic is None:
         return []
-    spread = evidence.sigmas[seen] * np.sqrt(shares(evidence)[seen])
-    factor = (evidence.sigmas[seen] / spread)[:, None]
-    x = evidence.residuals[seen] / spread * (evidence.sigma0_apriori / evidence.sigma0)
-    if np.ptp(x) == 0.0:
-        return []
-    simulated = simulate(evidence, lambda v: np.column_stack([_moments(v[seen] * factor), v.sum(axis=0), (v * v).sum(axis=0)]), options)
-    note = null_note(evidence, options, 0 if simulated is None else len(simulated)) + skipped_note(int((~seen).sum()))
+    null = simulate(evidence, "moments", statistic, options)
+    note = null_note(evidence, options, 0 if null is None else len(null)) + skipped_note(int((~seen).sum()))
     level = options.global_level(1)
-    if simulated is None:
+    if null is None:
         made = [_test(i, x, level, None, note) for i in range(3) if len(x) >= _LEAST[i]]
         own = f"Null law by {options.replicas} simulated samples of independent normal values, seed {options.seed}: approximate."
         return [*made, jarque_bera(x, level, replicas=options.replicas, seed=options.seed, note=own)]
-    moments = [_test(i, x, level, simulated[:, i], note) for i in range(3)]
-    moments[0] = _mean_by_sum(evidence, moments[0], simulated[:, 3], simulated[:, 4])
-    if np.ptp(simulated[:, 1]) <= 1e-9:
+    moments = [_test(i, x, level, null[:, i], note) for i in range(3)]
+    moments[0] = _mean_by_sum(evidence, moments[0], null[:, 3], null[:, 4])
+    if np.ptp(null[:, 1]) <= 1e-9:
         why = "the residuals are so bound to each other that their skewness is the same whatever the errors."
         moments[1] = not_applicable(_NAMES[1], _NULLS[1], why, level)
-    return [*moments, jarque_bera(x, level, simulated=_jarque_bera_of(len(x), simulated[:, 1], simulated[:, 2]), note=note)]
+    return [*moments, jarque_bera(x, level, simulated=_jarque_bera_of(len(x), null[:, 1], null[:, 2]), note=note)]
 
 
 def _jarque_bera_of(n: int, skewness: Any, kurtosis: Any) -> Any:
@@ -486,11 +503,10 @@ def _mean_by_sum(evidence: Evidence, plain: TestResult, sums: Floats, squares: F
     t = sum_of_residuals(total, value, factor, r, plain.alpha, float(n), f"{note}: exact for normal errors.")
     details = {**plain.details, **t.details}
     if exact or not t.details.get("applicable", True):
-        return TestResult(**{**vars(t), "details": details})
+        return replace(t, details=details)
     # with correlated observations s0 of a replica is not at hand from v / sigma: its root mean square stands for it, in data and replicas
     size = float(np.sqrt(np.mean((evidence.residuals / evidence.sigmas) ** 2)))
     law = SimulatedLaw(np.sort(sums / np.sqrt(squares / n * value)))
     said = f"{note} (by simulation), s0 by the root mean square. {plain.note}"
-    return TestResult(
-        **{**vars(t), "statistic": total / size / np.sqrt(value), "law": law, "law_name": plain.law_name, "note": said, "details": details}
-    )
+    statistic = total / size / np.sqrt(value)
+    return replace(t, statistic=statistic, law=law, law_name=plain.law_name, note=said, details=details)

@@ -130,6 +130,71 @@ def length_deviations(lengths: Floats, deviations: Floats, sigmas: Floats, unit:
     return drawn(name, (6.2, 3.2), draw)
 
 
+def iterations(
+    counts: Sequence[int],
+    objective: Floats,
+    relative: Floats,
+    damping: Floats,
+    accepted: NDArray[np.bool_],
+    what: str,
+    name: str = "iterations",
+) -> str:
+    """Return the course of the iterations: what is made least, the relative step, and the damping where there was any.
+
+    Parameters
+    ----------
+    counts : sequence of int
+        Numbers of the iterations, from 0 for the start.
+    objective, relative, damping : (n,) arrays
+        What is made least, relative step (NaN where there is none), and Levenberg's damping (0 = none).
+    accepted : (n,) array of bool
+        Steps that were not refused.
+    what : str
+        Name of what is made least.
+    name : str
+        Prefix of ids.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> svg = iterations([0, 1], np.array([5.0, 2.0]), np.array([np.nan, 0.3]), np.zeros(2), np.ones(2, dtype=bool), "v'Pv")
+    >>> svg.startswith("<svg")
+    True
+    """
+    x = np.asarray(counts)
+    panels = [(what, objective, BLUE), (tr("relative step"), relative, ORANGE)]
+    if (damping > 0.0).any():
+        panels.append((tr("damping"), np.where(damping > 0.0, damping, np.nan), GREEN))
+
+    def draw(figure: Any) -> None:
+        from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+        for axes, (title, values, colour) in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
+            seen = np.isfinite(values) & accepted
+            axes.plot(x[seen], values[seen], "o-", color=colour, markersize=3.5, linewidth=1.2)
+            out = np.isfinite(values) & ~accepted
+            axes.plot(x[out], values[out], "x", color=INK, markersize=5)
+            known = values[np.isfinite(values)]
+            # A log-likelihood may be negative, and a range below a power of ten has no ticks of its own on a logarithmic scale.
+            if len(known) and known.min() > 0.0 and known.max() > 20.0 * known.min():
+                axes.set_yscale("log")
+                axes.yaxis.set_major_locator(LogLocator(numticks=6))
+                axes.yaxis.set_minor_formatter(NullFormatter())
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.6g}"))
+            axes.set_title(title, loc="left")
+            axes.set_xlabel(tr("iteration"))
+            axes.xaxis.get_major_locator().set_params(integer=True)
+            for side in ("top", "right"):
+                axes.spines[side].set_visible(False)
+            axes.grid(True)
+            axes.tick_params(length=3)
+
+    return drawn(name, (3.0 * len(panels) + 0.4, 2.5), draw)
+
+
 def cell_maps(cells: Sequence[tuple[str, Floats, str]], frame: tuple[float, float, float, float], y_down: bool, name: str) -> str:
     """Return maps over the image side by side: one value per cell of a grid.
 
@@ -156,7 +221,17 @@ def cell_maps(cells: Sequence[tuple[str, Floats, str]], frame: tuple[float, floa
             rows, columns = values.shape
             x = np.linspace(left, right, columns + 1)
             y = np.linspace(low, high, rows + 1)
-            shown = axes.pcolormesh(x, y, np.ma.masked_invalid(values), cmap=colours, rasterized=True)
+            # A few cells with hardly controlled points would take all colours from the others.
+            known = values[np.isfinite(values)]
+            low_end, high_end = float(known.min()), float(known.max())
+            least, most = (float(np.quantile(known, q)) for q in (0.03, 0.97))
+            outer = (
+                low_end if most - low_end < 3.0 * (most - least) else least,
+                high_end if high_end - least < 3.0 * (most - least) else most,
+            )
+            extend = ("both" if outer[1] < high_end else "min") if outer[0] > low_end else "max" if outer[1] < high_end else "neither"
+            span = {"vmin": outer[0], "vmax": outer[1]} if outer[1] > outer[0] else {}
+            shown = axes.pcolormesh(x, y, np.ma.masked_invalid(values), cmap=colours, rasterized=True, **span)
             axes.set_aspect("equal")
             if y_down:
                 axes.invert_yaxis()
@@ -164,7 +239,7 @@ def cell_maps(cells: Sequence[tuple[str, Floats, str]], frame: tuple[float, floa
             axes.set_xlabel(tr("image x (px)"))
             axes.tick_params(length=3)
             axes.locator_params(nbins=5)
-            bar = figure.colorbar(shown, ax=axes, location="bottom", shrink=0.9, aspect=24)
+            bar = figure.colorbar(shown, ax=axes, location="bottom", shrink=0.9, aspect=24, extend=extend)
             bar.outline.set_visible(False)
         figure.axes[0].set_ylabel(tr("image y (px)"))
 

@@ -98,7 +98,8 @@ def drawn(name: str, size: tuple[float, float], draw: Callable[[Any], None]) -> 
         draw(figure)
         figure.savefig(out, format="svg", dpi=130, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     # Names come from strangers: nothing that XML forbids, nothing that turns the direction of writing.
-    return _own("".join(c if c.isprintable() or c == "\n" else "\ufffd" for c in out.getvalue()), name)
+    lines = out.getvalue().split("\n")
+    return _own("\n".join(t if t.isprintable() else "".join(c if c.isprintable() else "\ufffd" for c in t) for t in lines), name)
 
 
 def _own(svg: str, name: str) -> str:
@@ -381,8 +382,7 @@ def plan(
     unit, sigma_unit : str
     name : str
     """
-    everything = np.concatenate([points, cameras]) if len(points) else cameras
-    low, high = everything.min(axis=0), everything.max(axis=0)
+    low, high = core_of(points, cameras)
     # Long coordinates are told as an offset in the axis label.
     origin = np.where(np.abs(low) > 50.0 * np.maximum(high - low, 1e-12), np.floor(low / 100.0) * 100.0, 0.0)
     reach = 0.07 * float((high - low).max() or 1.0)
@@ -419,7 +419,9 @@ def plan(
             for label, a, b in zip(camera_labels, x.tolist(), y.tolist(), strict=True):
                 axes.annotate(label[:16], (a, b), xytext=(4, 4), textcoords="offset points", fontsize=7, color=MUTED)
         axes.set_aspect("equal" if 0.18 <= spread[k] / spread[0] <= 6.0 else "auto")
-        axes.margins(0.06)
+        for put, j in ((axes.set_xlim, 0), (axes.set_ylim, k)):
+            edge = 0.06 * float(spread[j]) + 0.3 * reach
+            put(low[j] - origin[j] - edge, high[j] - origin[j] + edge)
         axes.ticklabel_format(useOffset=False, style="plain")
         axes.set_xlabel(_axis("X", origin[0], unit))
         axes.set_ylabel(_axis("XYZ"[k], origin[k], unit))
@@ -440,6 +442,31 @@ def plan(
             bar.outline.set_visible(False)
 
     return drawn(name, (7.4, float(np.clip(5.6 * sum(ratio) + 1.6, 5.0, 11.0))), draw)
+
+
+def core_of(points: Floats, cameras: Floats) -> tuple[Floats, Floats]:
+    """Return the corners of the box that holds the cameras and nearly all points: a few far away do not make the others small.
+
+    Parameters
+    ----------
+    points, cameras : (n, 3), (m, 3) arrays
+
+    Returns
+    -------
+    low, high : (3,) arrays
+
+    Examples
+    --------
+    >>> cloud = np.concatenate([np.random.default_rng(1).uniform(0, 1, (500, 3)), [[900.0, 0, 0]]])
+    >>> bool(core_of(cloud, np.zeros((1, 3)))[1][0] < 2.0)
+    True
+    """
+    if len(points):
+        low, high = (np.quantile(points, q, axis=0) for q in (0.01, 0.99))
+        rim = 0.25 * float((high - low).max())
+        low, high = np.maximum(points.min(axis=0), low - rim), np.minimum(points.max(axis=0), high + rim)
+        return np.asarray(np.minimum(low, cameras.min(axis=0))), np.asarray(np.maximum(high, cameras.max(axis=0)))
+    return np.asarray(cameras.min(axis=0)), np.asarray(cameras.max(axis=0))
 
 
 def _axis(letter: str, origin: float, unit: str) -> str:

@@ -11,7 +11,8 @@ from baarda.report import plots
 from baarda.report.residual_verdict import KINDS, sentences
 from baarda.report.sections._laws import classes_table, decision, figures, laws_table, ratios_table, scale_table, short, table_of_tests
 from baarda.report.sections._numbers import MISSING, fixed, probability, significant
-from baarda.report.sections.base import Block, Cell, Column, DataTable, Figure, Items, Paragraph, Section, Verdict, say
+from baarda.report.sections.base import Block, Cell, Column, DataTable, Figure, Items, Paragraph, Section, Verdict, say, translated
+from baarda.report.translation import tr
 
 MOST_ROWS = 200
 
@@ -37,7 +38,7 @@ def sections(table: ResidualTable, study: ResidualStudy) -> list[Section]:
         ("scales", "Scale rules", [scale_table(study.scale_rules)]),
         ("left-out", "What was not done", _left_out(study)),
     ]
-    return [Section(anchor, title, tuple(blocks)) for anchor, title, blocks in parts if blocks]
+    return [translated(Section(anchor, title, tuple(blocks))) for anchor, title, blocks in parts if blocks]
 
 
 def _sample_blocks(table: ResidualTable, study: ResidualStudy) -> list[Block]:
@@ -53,7 +54,7 @@ def _sample_blocks(table: ResidualTable, study: ResidualStudy) -> list[Block]:
             say(
                 "Studied are {kind}. All p-values hold for independent values. Residuals of one adjustment are weakly correlated and more "
                 "normal than the errors behind them: where a test does not reject, the errors may still deviate.",
-                kind=KINDS[study.kind],
+                kind=tr(KINDS[study.kind]),
             )
         ),
         DataTable(
@@ -89,7 +90,7 @@ def _groups_blocks(study: ResidualStudy) -> list[Block]:
         chosen = np.argsort(p, kind="stable")[:MOST_ROWS]
         rows = [
             (
-                groups.names[order[i]] or "(no name)",
+                groups.names[order[i]] or tr("(no name)"),
                 str(int(groups.counts[order[i]])),
                 significant(float(groups.means[order[i]]), 3),
                 significant(float(np.sqrt(groups.variances[order[i]])), 4),
@@ -100,18 +101,19 @@ def _groups_blocks(study: ResidualStudy) -> list[Block]:
             )
             for i in chosen
         ]
-        about = "redundancy numbers" if groups.by_redundancy else "values minus one"
+        about = "degrees of freedom: redundancy numbers" if groups.by_redundancy else "degrees of freedom: values minus one"
         columns = (
             Column("group", "", "the most deviating first", "left"),
             Column("n", "", "number of values"),
             Column("mean", "", "of the residuals" if study.kind == "raw" else "of the residuals divided by their sigmas"),
             Column("S", "", "standard deviation"),
-            Column("r", "", f"degrees of freedom: {about}"),
+            Column("r", "", about),
             Column("r S² / S² pooled", "", "the statistic that is judged"),
             Column("p", "", "two-sided, under the beta law of a part of the pooled variance"),
             Column("decision", "", "", "left"),
         )
-        shortened = "" if len(order) <= MOST_ROWS else f"The first {MOST_ROWS} of {len(order)} rows; all are in tables/groups."
+        told = {"most": MOST_ROWS, "count": len(order), "file": "tables/groups"}
+        shortened = "" if len(order) <= MOST_ROWS else say("The first {most} of {count} rows; all are in {file}.", **told)
         blocks.append(DataTable("Groups", columns, tuple(rows), shortened, folded=len(rows) > 30))
     return blocks
 
@@ -128,15 +130,15 @@ def _group_figure(groups: Groups, order: np.ndarray, rejected: np.ndarray, poole
             (rejected, "D", plots.ORANGE, "rejected"),
         ):
             if chosen.any():
-                axes.plot(x[chosen], ratio[chosen], marker, color=colour, markersize=5, label=word)
+                axes.plot(x[chosen], ratio[chosen], marker, color=colour, markersize=5, label=tr(word))
         axes.axhline(1.0, color=plots.INK, linewidth=0.9, linestyle=(0, (5, 2)))
         axes.set_xlim(0.25, len(ratio) + 0.75)
         if len(labels) <= 40:
             short = [t if len(t) <= 14 else f"{t[:12]}.." for t in labels]
             upright = sum(len(t) + 1 for t in short) > 90
             axes.set_xticks(x, short, **({"rotation": 60, "ha": "right", "rotation_mode": "anchor"} if upright else {}))
-        axes.set_xlabel("group" if len(labels) <= 40 else "group, in the order of the table")
-        axes.set_ylabel("S / S pooled")
+        axes.set_xlabel(tr("group" if len(labels) <= 40 else "group, in the order of the table"))
+        axes.set_ylabel(tr("S / S pooled"))
         axes.margins(y=0.15)
         axes.grid(True, axis="y")
         figure.legend(loc="outside upper left", ncols=2)  # type: ignore[attr-defined]
@@ -170,4 +172,4 @@ def _laws_blocks(study: ResidualStudy) -> list[Block]:
 def _left_out(study: ResidualStudy) -> list[Block]:
     if not study.left_out:
         return []
-    return [Items("These parts do not apply to the table:", tuple(f"{what}: {why}." for what, why in study.left_out))]
+    return [Items("These parts do not apply to the table:", tuple(f"{tr(what)}: {tr(why)}." for what, why in study.left_out))]

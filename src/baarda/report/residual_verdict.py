@@ -8,9 +8,10 @@ from baarda.formats.residual_table import ResidualTable
 from baarda.hypotheses.base import TestResult
 from baarda.procedures.law_study import LawsStudied, LawStudy
 from baarda.procedures.residual_study import ResidualStudy
-from baarda.report.sections._numbers import fixed, names, plural, probability, significant
+from baarda.report.sections._numbers import fixed, names, p_stated, plural, significant
 from baarda.report.sections.base import Sentence, Tone, say
 from baarda.report.sections.verdict import law_name
+from baarda.report.translation import tr
 
 KINDS = {
     "raw": "the residuals as they stand in the table",
@@ -43,8 +44,8 @@ def _sample(table: ResidualTable, study: ResidualStudy) -> Sentence:
         "kurtosis {kurtosis} (normal: 0 and 3).",
         count=plural(study.n, "value"),
         column=table.column,
-        kind=KINDS[study.kind],
-        aside=f", {study.set_aside} that no other observation controls were set aside" if study.set_aside else "",
+        kind=tr(KINDS[study.kind]),
+        aside=say(", {count} that no other observation controls were set aside", count=study.set_aside) if study.set_aside else "",
         mean=significant(study.mean, 3),
         deviation=significant(study.deviation, 4),
         skewness=fixed(study.skewness, 3),
@@ -79,17 +80,18 @@ def _moments_sentence(study: ResidualStudy) -> Sentence | None:
     if not known:
         return None
     wrong = [name for name, t in known.items() if t.rejected]
-    ps = ", ".join(f"{name} p {_p(t.p_value)}" for name, t in known.items())
+    ps = ", ".join(f"{tr(name)} p {p_stated(t.p_value)}" for name, t in known.items())
     if not wrong:
         text, tone = say("No moment contradicts normal residuals with expectation zero ({ps}).", ps=ps), "good"
     else:
         parts = []
         if "mean" in wrong:
-            parts.append("the mean differs from zero: a systematic part is left")
+            parts.append(tr("the mean differs from zero: a systematic part is left"))
         if "skewness" in wrong:
-            parts.append("the residuals are skew")
+            parts.append(tr("the residuals are skew"))
         if "kurtosis" in wrong:
-            parts.append(f"the tails are {'longer' if study.kurtosis > 3.0 else 'shorter'} than those of the normal law")
+            longer = "the tails are longer than those of the normal law"
+            parts.append(tr(longer if study.kurtosis > 3.0 else "the tails are shorter than those of the normal law"))
         text, tone = say("By the moments {parts} ({ps}).", parts="; ".join(parts), ps=ps), "bad" if "mean" in wrong else "warn"
     return Sentence("Moments", text, "good" if tone == "good" else "bad" if tone == "bad" else "warn", "tests")
 
@@ -100,14 +102,20 @@ def _homogeneity(study: ResidualStudy) -> Sentence | None:
         return None
     common, each = groups.test("bartlett"), groups.test("variance_per_group")
     if common is None or each is None:
-        return Sentence("Groups", "The variances of the groups could not be compared; see what was left out.", "info", "groups")
+        said = tr("The variances of the groups could not be compared; see what was left out.")
+        return Sentence("Groups", said, "info", "groups")
     robust = groups.test("brown_forsythe")
-    fields = {"k": len(groups.tested), "t": fixed(float(common.statistic), 2), "limit": fixed(upper(common), 2), "p": _p(common.p_value)}
+    fields = {
+        "k": len(groups.tested),
+        "t": fixed(float(common.statistic), 2),
+        "limit": fixed(upper(common), 2),
+        "p": p_stated(common.p_value),
+    }
     beyond = int(np.sum(each.rejected))
     text = say(
         "The variances of {k} groups are {verb} (Bartlett {t}, limit {limit}, p {p}); {beyond} of them differ from the pooled variance "
         "singly, where chance alone gives about {chance}.",
-        verb="not equal" if common.rejected else "not shown to differ",
+        verb=tr("not equal" if common.rejected else "not shown to differ"),
         beyond=beyond,
         chance=significant(each.alpha * len(groups.tested), 2),
         **fields,
@@ -115,8 +123,8 @@ def _homogeneity(study: ResidualStudy) -> Sentence | None:
     if robust is not None and bool(robust.rejected) != bool(common.rejected):
         text += say(
             " Brown and Forsythe's test, which does not lean on the normal law, {verb} (p {p}).",
-            verb="does reject" if robust.rejected else "does not reject",
-            p=_p(robust.p_value),
+            verb=tr("does reject" if robust.rejected else "does not reject"),
+            p=p_stated(robust.p_value),
         )
     return Sentence("Homogeneity", text, "bad" if common.rejected else "good", "groups")
 
@@ -126,19 +134,16 @@ def upper(test: TestResult) -> float:
     return test.critical[1] if isinstance(test.critical, tuple) else test.critical
 
 
-def _p(p: float | None) -> str:
-    text = probability(p)
-    return text if text.startswith("<") else f"= {text}"
-
-
 def _how(laws: LawsStudied, law: LawStudy) -> str:
     """Return the deciding test with its numbers."""
     if laws.judged_by(law) == "anderson_darling":
         test = law.test("anderson_darling")
         if test is not None:
-            return f"A² {significant(float(test.statistic), 3)}, limit {significant(upper(test), 3)}, p {_p(test.p_value)}"
+            fields = {"value": significant(float(test.statistic), 3), "limit": significant(upper(test), 3), "p": p_stated(test.p_value)}
+            return say("A² {value}, limit {limit}, p {p}", **fields)
     f = law.fit
-    return f"chi-square {fixed(f.statistic, 1)}, limit {fixed(f.critical, 1)}, p {_p(f.p_value)}"
+    fields = {"value": fixed(f.statistic, 1), "limit": fixed(f.critical, 1), "p": p_stated(f.p_value)}
+    return say("chi-square {value}, limit {limit}, p {p}", **fields)
 
 
 def _normal(study: ResidualStudy) -> Sentence | None:
@@ -157,9 +162,9 @@ def _modulated(study: ResidualStudy) -> Sentence | None:
     a, (low, high) = laws.modulated.parameters["a"], laws.interval
     bounds = []
     if np.isinf(high):
-        bounds.append("it reaches a = ∞, the normal law itself")
+        bounds.append(tr("it reaches a = ∞, the normal law itself"))
     if study.options.loc is None and low <= _FREE_CENTRE * (1.0 - 1e-9):
-        bounds.append("its lower end is the bound of a where the mean is free")
+        bounds.append(tr("its lower end is the bound of a where the mean is free"))
     text = say(
         "Among the modulated normal laws a = {a} fits best, with {level} % interval {low} to {high}{bounds}.",
         a=significant(a, 3),
@@ -173,14 +178,16 @@ def _modulated(study: ResidualStudy) -> Sentence | None:
         tone = "warn" if laws.ratio.rejected else "good"
         text += say(
             " The likelihood ratio {verb} the normal in favour of a finite a (2 ln L {t}, limit {limit}, p {p}).",
-            verb="rejects" if laws.ratio.rejected else "does not reject",
+            verb=tr("rejects" if laws.ratio.rejected else "does not reject"),
             t=fixed(float(laws.ratio.statistic), 2),
             limit=fixed(upper(laws.ratio), 2),
-            p=_p(laws.ratio.p_value),
+            p=p_stated(laws.ratio.p_value),
         )
     if study.a_of_errors is not None and np.isfinite(study.a_of_errors) and tone == "warn":
         text += say(
-            " By the kurtosis relation the errors behind the residuals are less normal: a about {a}.", a=significant(study.a_of_errors, 2)
+            " By the kurtosis relation the errors behind the residuals are less normal: a about {a}. The two differ because the likelihood "
+            "weighs all residuals and the kurtosis the tails, and because residuals mix errors.",
+            a=significant(study.a_of_errors, 2),
         )
     return Sentence("Modulated normal", text, tone, "laws")
 
@@ -199,17 +206,19 @@ def _rivals(study: ResidualStudy) -> Sentence | None:
         text += say(
             "; the smallest AIC has the {name}{judged}.",
             name=law_name(best.fit.law, best.fit.parameters.get("a")),
-            judged=", though it is rejected" if laws.rejected(best) else "",
+            judged=tr(", though it is rejected") if laws.rejected(best) else "",
         )
     else:
         text += "."
     if len(kept) > 1:
-        text += " The values do not tell the laws that are kept apart."
+        text += tr(" The values do not tell the laws that are kept apart.")
     return Sentence("Laws compared", text, "info" if kept else "warn", "laws")
 
 
 def _are(laws: list[str]) -> str:
-    return "none is" if not laws else f"{laws[0]} is" if len(laws) == 1 else f"{names(laws, 9)} are"
+    if not laws:
+        return tr("none is")
+    return say("{law} is", law=laws[0]) if len(laws) == 1 else say("{laws} are", laws=names(laws, 9))
 
 
 def _scales(study: ResidualStudy) -> Sentence | None:

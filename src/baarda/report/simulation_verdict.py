@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baarda.network import AXES
-from baarda.observations import Direct, ImagePoints
+from baarda.observations import Direct, ImagePoints, component_unit
 from baarda.procedures.planning import Planned
 from baarda.procedures.proof import Proof
 from baarda.report.sections._numbers import column, finer, fixed, names, plural, significant
-from baarda.report.sections.base import Sentence, say
+from baarda.report.sections.base import Sentence, say, told
+from baarda.report.translation import tr
 
 _WEAK = 0.1
 
@@ -72,13 +73,16 @@ def prediction(planned: Planned) -> dict[str, Any]:
 
 
 def _other_rows(planned: Planned, image_rows: NDArray[np.bool_]) -> dict[str, list[int]]:
-    """Return the controlled observations that are no image points, by the unit of their group; rows of mixed units are left out."""
+    """Return the controlled observations that are no image points, by their unit; directly observed unknowns are left out."""
     out: dict[str, list[int]] = {}
     a = planned.adjustment
     for g, group in enumerate(a.groups):
-        rows = [i for i in range(a.offsets[g], a.offsets[g + 1]) if planned.controlled[i] and not image_rows[i]]
-        if rows and not isinstance(group, Direct):
-            out.setdefault(str(group.unit), []).extend(rows)
+        if isinstance(group, Direct):
+            continue
+        for row in range(int(a.offsets[g]), int(a.offsets[g + 1])):
+            if planned.controlled[row] and not image_rows[row]:
+                unit = component_unit(group, (row - int(a.offsets[g])) % len(group.components))
+                out.setdefault(unit, []).append(row)
     return out
 
 
@@ -101,14 +105,14 @@ def sentences(planned: Planned, proof: Proof | None) -> list[Sentence]:
     a, figures, o = planned.adjustment, prediction(planned), planned.options
     out = [
         Sentence(
-            "network",
+            "Network",
             say(
                 "{n} observations, {u} unknowns, redundancy {r}; true geometry: {reason}. {datum}",
                 n=a.count,
                 u=a.numbering.count,
                 r=a.redundancy,
-                reason=planned.reason,
-                datum=a.datum.text,
+                reason=_reason(planned),
+                datum=told(a.datum.text),
             ),
             "info",
         )
@@ -118,20 +122,20 @@ def sentences(planned: Planned, proof: Proof | None) -> list[Sentence]:
         unit, factor = finer(a.network.unit, [v for v in p["median"].values() if v is not None])
         wanted = [v for d in (p["median"], p["largest"]) for v in d.values()]
         known = iter(column([v * factor for v in wanted if v is not None], 2))
-        told = ["fixed" if v is None else next(known) for v in wanted]
+        shown = [tr("fixed") if v is None else next(known) for v in wanted]
         out.append(
             Sentence(
-                "precision",
+                "Precision",
                 say(
                     "Predicted standard deviations of {count} points, median X {x}, Y {y}, Z {z} {unit}; largest {lx}, {ly}, {lz} {unit}; "
                     "weakest: {weak}.",
                     count=p["count"],
-                    x=told[0],
-                    y=told[1],
-                    z=told[2],
-                    lx=told[3],
-                    ly=told[4],
-                    lz=told[5],
+                    x=shown[0],
+                    y=shown[1],
+                    z=shown[2],
+                    lx=shown[3],
+                    ly=shown[4],
+                    lz=shown[5],
                     unit=unit,
                     weak=names(p["weakest"]),
                 ),
@@ -151,7 +155,7 @@ def sentences(planned: Planned, proof: Proof | None) -> list[Sentence]:
             level=f"{o.alpha_outlier:g}",
             most=significant(m["largest_px"]),
         )
-        out.append(Sentence("reliability", text, "warn" if r["uncontrolled"] else "info", "reliability"))
+        out.append(Sentence("Reliability", text, "warn" if r["uncontrolled"] else "info", "reliability"))
     elif figures["mdb_other"]:
         text = say(
             "Redundancy numbers average {mean}; found with power {power} at level {level} are biases from {biases} on.",
@@ -171,22 +175,26 @@ def sentences(planned: Planned, proof: Proof | None) -> list[Sentence]:
                 4,
             ),
         )
-        out.append(Sentence("reliability", text, "warn" if r["uncontrolled"] else "info", "reliability"))
+        out.append(Sentence("Reliability", text, "warn" if r["uncontrolled"] else "info", "reliability"))
     if r["uncontrolled"]:
-        text = say("{rows} not controlled by any other: errors in them stay hidden.", rows=_are(r["uncontrolled"], "observation"))
-        out.append(Sentence("uncontrolled", text, "warn", "reliability"))
+        rows = plural(r["uncontrolled"], "observation is", "observations are")
+        text = say("{rows} not controlled by any other: errors in them stay hidden.", rows=rows)
+        out.append(Sentence("Uncontrolled", text, "warn", "reliability"))
     high = figures["correlations"]
     if high:
         c = high[0]
         text = say(
             "{n} with |correlation| of at least 0.95, first {a} with {b} ({v}).", n=plural(len(high), "pair"), **c, v=fixed(c["value"], 4)
         )
-        out.append(Sentence("correlations", text, "warn", "cameras"))
+        out.append(Sentence("Correlations", text, "warn", "cameras"))
     return out + (_proof_sentences(proof) if proof is not None else [])
 
 
-def _are(count: int, word: str) -> str:
-    return f"{plural(count, word)} {'is' if count == 1 else 'are'}"
+def _reason(planned: Planned) -> str:
+    """Return why this geometry is taken for true, in the current language."""
+    head, _, value = planned.reason.rpartition(" ")
+    template = "the adjusted geometry, standard deviation of unit weight {value}"
+    return say(template, value=value) if template.startswith(f"{head} {{") else tr(planned.reason)
 
 
 def _proof_sentences(p: Proof) -> list[Sentence]:
@@ -194,7 +202,7 @@ def _proof_sentences(p: Proof) -> list[Sentence]:
     asked, count = p.replicas.asked, p.replicas.count
     if count < asked:
         text = say("{lost} of {asked} replicas have no result: {first}", lost=asked - count, asked=asked, first=p.replicas.batch.failed[0])
-        out.append(Sentence("replicas", text, "warn", "proof"))
+        out.append(Sentence("Replicas", text, "warn", "proof"))
     s = p.sigmas
     wrong = [x.name for x in s if not x.holds]
     low, high = min(s, key=lambda x: x.ratio), max(s, key=lambda x: x.ratio)
@@ -202,51 +210,55 @@ def _proof_sentences(p: Proof) -> list[Sentence]:
         "{count} replicas: sampled / predicted standard deviations lie between {low} ({a}) and {high} ({b}); {decision}.",
         count=count,
         low=fixed(low.ratio, 3),
-        a=low.name,
+        a=tr(low.name),
         high=fixed(high.ratio, 3),
-        b=high.name,
-        decision=say("beyond chance for {names}", names=names(wrong)) if wrong else "chance explains the differences",
+        b=tr(high.name),
+        decision=say("beyond chance for {names}", names=names([tr(w) for w in wrong])) if wrong else tr("chance explains the differences"),
     )
-    out.append(Sentence("sigmas", text, "bad" if wrong else "good", "proof"))
+    out.append(Sentence("Sigmas", text, "bad" if wrong else "good", "proof"))
     if any(getattr(g, "residual_plane", "image") == "corrected" for g in p.replicas.planned.adjustment.groups):
         text = (
             "The errors drawn are those of measured image coordinates; this network takes its residuals in the corrected plane, where the "
             "distortion stretches them. --residual-plane image avoids it."
         )
-        out.append(Sentence("residual plane", text, "warn", "proof"))
+        out.append(Sentence("Residual plane", tr(text), "warn", "proof"))
     sure = 1e-4
     if p.worst[2] < sure:
         text = say("The errors of {name} scatter {ratio} times as predicted: beyond chance.", name=p.worst[0], ratio=fixed(p.worst[1], 3))
-        out.append(Sentence("single sigmas", text, "bad", "proof"))
+        out.append(Sentence("Single sigmas", text, "bad", "proof"))
     if p.bias[2] < sure:
         text = say(
             "The mean error of {name} is {mean} of its standard deviation: beyond chance, the network is noticeably not linear.",
             name=p.bias[0],
             mean=fixed(p.bias[1], 3),
         )
-        out.append(Sentence("bias", text, "warn", "proof"))
+        out.append(Sentence("Mean errors", text, "warn", "proof"))
     text = say(
         "v'Pv averages {mean}, expected is r = {r} (95 % of such means lie within {half} of it).",
         mean=fixed(p.objective.rate, 1),
         r=fixed(p.objective.expected, 0),
         half=fixed(1.96 * float(np.sqrt(2.0 * p.objective.expected / count)), 1),
     )
-    out.append(Sentence("global", text, "good" if p.objective.holds else "bad", "proof"))
-    told = [x for x in p.sizes if x.told]
-    wrong = [f"{x.name} ({100 * x.rate:.3g} % instead of {100 * x.expected:.3g} %)" for x in told if not x.holds]
-    words = say("not so: {names}", names=names(wrong)) if wrong else "none deviates beyond chance"
+    out.append(Sentence("Global test", text, "good" if p.objective.holds else "bad", "proof"))
+    known = [x for x in p.sizes if x.told]
+    wrong = [
+        say("{test} ({rate} % instead of {level} %)", test=x.name, rate=f"{100 * x.rate:.3g}", level=f"{100 * x.expected:.3g}")
+        for x in known
+        if not x.holds
+    ]
+    words = say("not so: {names}", names=names(wrong)) if wrong else tr("none deviates beyond chance")
     text = say(
         "{count} of {all} tests of true hypotheses reject as often as their level says; {words}.",
-        count=len(told) - len(wrong),
-        all=len(told),
+        count=len(known) - len(wrong),
+        all=len(known),
         words=words,
     )
-    if told:
-        out.append(Sentence("sizes", text, "bad" if wrong else "good", "proof"))
+    if known:
+        out.append(Sentence("Sizes of tests", text, "bad" if wrong else "good", "proof"))
     few = [x.name for x in p.sizes if not x.told]
     if few:
         text = say("Too few replicas to tell the size of {names}.", names=names(few, 4))
-        out.append(Sentence("replicas", text, "info", "proof"))
+        out.append(Sentence("Replicas", text, "info", "proof"))
     if p.power is not None:
         text = say(
             "Biases of the minimal detectable size are found by w in {rate} % of the replicas ({low} to {high} %), promised are {power} %; "
@@ -257,5 +269,5 @@ def _proof_sentences(p: Proof) -> list[Sentence]:
             power=fixed(100 * p.power.expected, 1),
             right=fixed(100 * p.identified, 1),
         )
-        out.append(Sentence("power", text, "good" if p.power.holds else "bad", "proof"))
+        out.append(Sentence("Power", text, "good" if p.power.holds else "bad", "proof"))
     return out

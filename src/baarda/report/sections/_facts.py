@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from baarda.cameras import FIXED
 from baarda.hypotheses.base import TestResult
 from baarda.network import AXES, CONTROL
-from baarda.observations import Direct, ImageCoordinates, ImagePoints
+from baarda.observations import Direct, ImageCoordinates, ImagePoints, component_unit
 from baarda.procedures.testing import Analysis
 from baarda.report.sections.base import say
 
@@ -58,20 +58,26 @@ def unit_of(analysis: Analysis, row: int) -> str:
             return str(a.network.cameras[group.nodes[i]].unit_of(int(group.positions[i])))
         if group.kind == "image":
             return "rad" if group.positions[i] >= 3 else a.network.unit
-    return str(group.unit)
+    return component_unit(group, (row - int(a.offsets[g])) % len(group.components))
 
 
 def rows_by_unit(analysis: Analysis, rows: Ints) -> dict[str, Ints]:
-    """Return scalar observations by their unit, in the order in which the units appear: numbers of different units are never mixed."""
+    """Return scalar observations, ascending, by their unit in the order in which the units appear: units are never mixed."""
     a = analysis.adjustment
-    out: dict[str, list[int]] = {}
-    known: dict[int, str] = {}
+    parts: list[tuple[str, Ints]] = []
     places = np.searchsorted(a.offsets, rows, side="right") - 1
-    for row, g in zip(rows.tolist(), places.tolist(), strict=True):
-        # Directly observed values have units of their own, row by row.
-        unit = unit_of(analysis, row) if isinstance(a.groups[g], Direct) else known.setdefault(g, unit_of(analysis, row))
-        out.setdefault(unit, []).append(row)
-    return {unit: np.array(at, dtype=np.intp) for unit, at in out.items()}
+    for g in np.unique(places).tolist():
+        at, group = rows[places == g], a.groups[g]
+        # Directly observed values have units of their own, row by row; others one for each component.
+        if isinstance(group, Direct):
+            parts += [(unit_of(analysis, row), np.array([row], dtype=np.intp)) for row in at.tolist()]
+            continue
+        component = (at - int(a.offsets[g])) % len(group.components)
+        parts += [(unit_of(analysis, int(at[component == c][0])), at[component == c]) for c in np.unique(component).tolist()]
+    joined: dict[str, list[Ints]] = {}
+    for unit, at in sorted(parts, key=lambda p: int(p[1][0])):
+        joined.setdefault(unit, []).append(at)
+    return {unit: np.sort(np.concatenate(at)) for unit, at in joined.items()}
 
 
 def label_of(analysis: Analysis, row: int) -> str:
@@ -128,7 +134,7 @@ def shares(analysis: Analysis) -> list[Share]:
         if 1 < len(kinds) <= 12:
             parts += [(kind, rows[components[rows] == kind]) for kind in kinds]
         for kind, at in parts:
-            units = {unit_of(analysis, int(i)) for i in at[: 2000 if isinstance(group, Direct) else 1]}
+            units = {unit_of(analysis, int(i)) for i in at[: 2000 if isinstance(group, Direct) else len(group.components)]}
             same = len(units) == 1
             rms = float(np.sqrt(np.mean(e.residuals[at] ** 2))) if same else float("nan")
             out.append(Share(group.name, kind, at, units.pop() if same else "", float(r[at].sum()), rms, float(energy[at].sum())))

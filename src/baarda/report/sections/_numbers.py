@@ -62,6 +62,18 @@ def probability(p: float | None) -> str:
     return "< 0.0001" if p < 1e-4 else f"{p:.4f}" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
+def p_stated(p: float | None) -> str:
+    """Return a p-value with its sign of equality, as a sentence needs it.
+
+    Examples
+    --------
+    >>> p_stated(0.03456), p_stated(1e-9)
+    ('= 0.035', '< 0.0001')
+    """
+    text = probability(p)
+    return text if text.startswith("<") else f"= {text}"
+
+
 def _exponent(value: float, digits: int) -> int:
     """Return the decimal exponent after rounding (0.0996 to two digits is 0.10)."""
     return int(f"{abs(value):.{digits - 1}e}".split("e")[1])

@@ -192,6 +192,7 @@ def say(template: str, **fields: Any) -> str:
     return tr(template).format(**fields)
 
 
+_NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?!\w)")
 #: Columns whose cells are names from the source: never translated.
 _NAMES = {"point", "image", "camera", "from", "to", "observation", "parameter", "unknown", "a", "b"}
 
@@ -219,40 +220,83 @@ def translated(section: Section) -> Section:
     return replace(section, title=tr(section.title), blocks=tuple(_translated(b) for b in section.blocks))
 
 
-def _told(text: str) -> str:
-    """Translate a fixed text, else what it is joined from, the longest parts first; a name in the first of two lines stays."""
-    known = tr(text)
-    if known != text or not any(mark in text for mark in (". ", ": ", "\n", " [")):
+def told(text: str) -> str:
+    """Translate a text that was composed elsewhere.
+
+    A fixed text, or one that is fixed but for its numbers (the catalogue has ``{0}``, ``{1}``, ... in their place), else what it is joined
+    from, the longest parts first; a name in the first of two lines stays.
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> from baarda.report.translation import language
+    >>> with language("de"):
+    ...     told("Null law by 999 simulated adjustments of normal errors, seed 0.")
+    'Nullverteilung aus 999 simulierten Ausgleichungen normaler Fehler, Startwert 0.'
+    """
+    known = _numbered(text)
+    if known != text or not any(mark in text for mark in (". ", ": ", "\n", " [", "] ")):
         return known
     head, line, rest = text.partition("\n")
     if line:
-        return f"{head}\n{_told(rest)}"
+        return f"{head}\n{told(rest)}"
+    head, mark, rest = text.partition("] ")
+    if mark and head.startswith("[") and head[1:].isdigit():
+        return f"{head}{mark}{told(rest)}"
     rest, _, mark = text.rpartition(" [")
     if rest and mark.rstrip("]").isdigit():
-        return f"{_told(rest)} [{mark}"
+        return f"{told(rest)} [{mark}"
     parts, out, at = re.split(r"(?<=[.:]) ", text), [], 0
     while at < len(parts):
         tried = ((end, " ".join(parts[at:end])) for end in range(len(parts), at, -1))
-        end, said = next(((e, tr(s)) for e, s in tried if tr(s) != s), (at + 1, parts[at]))
+        end, said = next(((e, _part(s)) for e, s in tried if _part(s) != s), (at + 1, parts[at]))
         out.append(said)
         at = end
     return " ".join(out)
 
 
+def _part(text: str) -> str:
+    """Translate one of several sentences: its text as it stands, or as it is joined to an earlier one by a blank."""
+    known = _numbered(text)
+    return known if known != text else _numbered(f" {text}")[1:]
+
+
+def _numbered(text: str) -> str:
+    known = tr(text)
+    if known != text or "{" in text:
+        return known
+    found: list[str] = []
+
+    def place(match: re.Match[str]) -> str:
+        found.append(match[0])
+        return f"{{{len(found) - 1}}}"
+
+    key = _NUMBER.sub(place, text)
+    known = tr(key)
+    return known.format(*found) if found and known != key else text
+
+
 def _translated(block: Block) -> Block:
     if isinstance(block, Paragraph):
-        return replace(block, text=_told(block.text))
+        return replace(block, text=told(block.text))
     if isinstance(block, Items):
-        return replace(block, intro=tr(block.intro), entries=tuple(_told(e) for e in block.entries))
+        return replace(block, intro=tr(block.intro), entries=tuple(told(e) for e in block.entries))
     if isinstance(block, Verdict):
         return Verdict(tuple(replace(s, subject=tr(s.subject), text=tr(s.text)) for s in block.sentences))
     if isinstance(block, (Figure, Interactive)):
-        return replace(block, title=tr(block.title), caption=_told(block.caption), alt=_told(block.alt))
+        return replace(block, title=tr(block.title), caption=told(block.caption), alt=told(block.alt))
     said = [c.name not in _NAMES for c in block.columns]
-    rows = tuple(tuple(_word(cell) if told else cell for cell, told in zip(row, said, strict=True)) for row in block.rows)
+    rows = tuple(tuple(_word(cell) if word else cell for cell, word in zip(row, said, strict=True)) for row in block.rows)
     columns = tuple(replace(c, name=tr(c.name), unit=tr(c.unit), meaning=tr(c.meaning)) for c in block.columns)
-    return replace(block, caption=tr(block.caption), note=_told(block.note), columns=columns, rows=rows)
+    return replace(block, caption=tr(block.caption), note=told(block.note), columns=columns, rows=rows)
 
 
 def _word(cell: str | Cell) -> str | Cell:
-    return replace(cell, text=_told(cell.text)) if isinstance(cell, Cell) else _told(cell)
+    return replace(cell, text=told(cell.text)) if isinstance(cell, Cell) else told(cell)

@@ -9,7 +9,7 @@ from baarda.procedures.testing import Analysis
 from baarda.report import plots
 from baarda.report.sections._facts import MOST_ROWS, correlation_matrix, first, result_of, scaling
 from baarda.report.sections._numbers import MISSING, fixed, powers, probability, significant, with_sigma
-from baarda.report.sections.base import Block, Cell, Column, DataTable, Figure, SectionMaker, say
+from baarda.report.sections.base import Block, Cell, Column, DataTable, Figure, Paragraph, SectionMaker, say
 from baarda.report.translation import tr
 
 _MOST_MAPS = 4
@@ -112,6 +112,10 @@ def _correlations(analysis: Analysis) -> list[Block]:
         columns = (Column("", "", "", "left"), *(Column(s) for s in short))
         most = say("highest: {a} and {b}, {r}", a=short[k], b=short[m], r=fixed(float(c[k, m]), 3))
         title = say("Correlations of the parameters of camera {label}", label=label)
+        if len(at) == 2:  # a map of one cell says no more than its number
+            pair = {"label": label, "a": short[0], "b": short[1], "r": fixed(float(c[0, 1]), 3)}
+            blocks.append(Paragraph(say("Correlation of the two estimated parameters of camera {label}, {a} and {b}: {r}.", **pair)))
+            continue
         figure = plots.heat_map(c, short, f"correlations-{i + 1}")
         alt = say("Matrix of the correlations of {count} camera parameters; {most}.", count=len(at), most=most)
         caption = say(

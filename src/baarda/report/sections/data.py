@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from baarda.network import ROLES
-from baarda.observations import ImagePoints
+from baarda.observations import ImagePoints, component_unit
 from baarda.procedures.testing import Analysis
+from baarda.report import drawings
 from baarda.report.sections._facts import MOST_ROWS, first
-from baarda.report.sections._numbers import finer, fixed, significant
-from baarda.report.sections.base import Block, Column, DataTable, Paragraph, SectionMaker, say
+from baarda.report.sections._numbers import finer, fixed, plural, significant
+from baarda.report.sections.base import Block, Column, DataTable, Figure, Paragraph, SectionMaker, say
+from baarda.report.translation import tr
 
 _PLANES = {
     "image": "image plane: v belongs to the coordinates as measured",
@@ -55,9 +57,11 @@ def _model(analysis: Analysis) -> list[Block]:
         ("camera models", "; ".join(f"camera {c.label}: {c.model.name} ({c.model.description})" for c in net.cameras[:8])),
         ("residuals", "; ".join(_PLANES[p] for p in planes) if planes else "of each observation as given"),
         ("solver", solvers.get(a.solver_name, a.solver_name)),
-        ("units", say("object space {unit}; image px; angles degrees in this report, radians in the tables", unit=net.unit)),
+        ("units", _units(analysis)),
         ("rotation", "camera from object, M = R3(kappa) R2(phi) R1(omega); the camera looks along -z, x right, y up"),
     ]
+    if not net.cameras:
+        rows = [row for row in rows if row[0] not in ("camera models", "rotation")]
     columns = (Column("item", "", "", "left"), Column("choice", "", "", "left"))
     return [
         DataTable(
@@ -75,16 +79,38 @@ def _apriori(analysis: Analysis) -> DataTable:
     for group in a.groups:
         s = group.sigma()
         same = isinstance(group, ImagePoints) or group.name.startswith(("control", "distances"))
+        if getattr(group, "units", None) is not None:  # components of different units
+            for c, component in enumerate(group.components):
+                rows.append((f"{group.name}, {component}", str(len(group)), _span(s[:, c], component_unit(group, c))))
+            continue
         unit, factor = finer(group.unit, s) if same else (group.unit, 1.0)
-        low, high = float(s.min()) * factor, float(s.max()) * factor
-        size = f"{low:.4g}" if np.isclose(low, high) else say("{low} to {high}", low=f"{low:.3g}", high=f"{high:.3g}")
-        rows.append((group.name, str(len(group) * len(group.components)), f"{size} {unit}".strip()))
+        rows.append((group.name, str(len(group) * len(group.components)), _span(s * factor, unit)))
     columns = (
         Column("group", "", "observations of one kind", "left"),
         Column("n", "", "number of scalar observations"),
         Column("a-priori sigma", "", "standard deviation assumed before the adjustment, unit as stated"),
     )
     return DataTable("A-priori standard deviations", columns, tuple(rows))
+
+
+def _units(analysis: Analysis) -> str:
+    a = analysis.adjustment
+    told = [
+        f"{group.name} {', '.join(f'{name} {component_unit(group, c)}' for c, name in enumerate(group.components))}"
+        for group in a.groups
+        if getattr(group, "units", None) is not None
+    ]
+    if not told:
+        return say("object space {unit}; image px; angles degrees in this report, radians in the tables", unit=a.network.unit)
+    seen = [tr("image px")] * bool(a.network.images.labels)
+    units = "; ".join([*seen, *told])
+    return say("object space {unit}; {units}; angles degrees in this report, radians in the tables", unit=a.network.unit, units=units)
+
+
+def _span(sigmas: np.ndarray, unit: str) -> str:
+    low, high = float(sigmas.min()), float(sigmas.max())
+    size = f"{low:.4g}" if np.isclose(low, high) else say("{low} to {high}", low=f"{low:.3g}", high=f"{high:.3g}")
+    return f"{size} {unit}".strip()
 
 
 def _history(analysis: Analysis) -> DataTable:
@@ -107,10 +133,41 @@ def _history(analysis: Analysis) -> DataTable:
     return DataTable("Iterations", columns, tuple(rows), first(len(history), MOST_ROWS, "the project's history"), folded=True)
 
 
+def _course(analysis: Analysis) -> list[Block]:
+    """Return the figure of the iterations; nothing where no step was taken."""
+    a = analysis.adjustment
+    steps = a.history
+    if len(steps) < 2:
+        return []
+    relative = np.array([np.nan if s.relative_step is None else s.relative_step for s in steps])
+    damping, accepted = np.array([s.damping for s in steps]), np.array([s.accepted for s in steps])
+    what = "v'Pv" if a.law is None else "- log L"
+    svg = drawings.iterations([s.count for s in steps], np.array([s.objective for s in steps]), relative, damping, accepted, what)
+    known = relative[np.isfinite(relative)]
+    caption = say(
+        "{what} falls from {first} to {last} in {steps}; the last relative step is {step}.",
+        what=what,
+        first=significant(steps[0].objective, 4),
+        last=significant(steps[-1].objective, 4),
+        steps=plural(len(steps) - 1, "iteration"),
+        step=f"{known[-1]:.1e}" if len(known) else tr("none"),
+    )
+    if (damping > 0.0).any():
+        caption += " " + say(
+            "Damped: {count}, at most with {most}.", count=plural(int((damping > 0.0).sum()), "step"), most=f"{damping.max():.0e}"
+        )
+    else:
+        caption += " " + tr("No step was damped: all are full Gauss-Newton steps.")
+    if not accepted.all():
+        caption += " " + say("Crosses: {count} refused, because it would have raised the sum.", count=int((~accepted).sum()))
+    alt = say("Curves over the iterations. {caption}", caption=caption)
+    return [Figure("iterations", "Course of the iterations", caption, alt, svg)]
+
+
 def _build(analysis: Analysis) -> list[Block]:
     name = analysis.adjustment.network.name
     intro: list[Block] = [Paragraph(say("Project: {name}.", name=name))] if name else []
-    return [*intro, _counts(analysis), *_model(analysis), _apriori(analysis), _history(analysis)]
+    return [*intro, _counts(analysis), *_model(analysis), _apriori(analysis), *_course(analysis), _history(analysis)]
 
 
 DATA = SectionMaker(30, "data", "Data and model", _build)

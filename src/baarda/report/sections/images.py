@@ -9,7 +9,7 @@ from baarda.procedures.testing import Analysis
 from baarda.report import plots
 from baarda.report.sections._facts import MOST_ROWS, first, result_of, scaling
 from baarda.report.sections._numbers import MISSING, column, decimals_for, finer, fixed
-from baarda.report.sections.base import Block, Cell, Column, DataTable, Figure, SectionMaker, say
+from baarda.report.sections.base import Block, Cell, Column, DataTable, Figure, SectionMaker, say, told
 
 _MOST_BARS = 120
 
@@ -87,7 +87,7 @@ def _precision(analysis: Analysis) -> list[Block]:
         Column("variance test", "", "is the variance of the image that of all images?", "left"),
         Column("suspected", "", "number of observations suspected of a gross error"),
     )
-    note = "" if test is None else say("Two-sided at level {alpha}, law: {law}.", alpha=f"{test.alpha:.3g}", law=test.law_name)
+    note = "" if test is None else say("Two-sided at level {alpha}, law: {law}.", alpha=f"{test.alpha:.3g}", law=told(test.law_name))
     more = first(len(table), MOST_ROWS, "tables/images.csv")
     blocks: list[Block] = []
     if test is not None and 2 <= len(table) <= _MOST_BARS:

@@ -107,12 +107,30 @@ def _critical(found: CriticalValues) -> list[Block]:
     return [DataTable("Critical values under the law of the errors", columns, tuple(rows), note)]
 
 
+def _two_values(analysis: Analysis, likelihood: float, kurtosis: float) -> Paragraph:
+    """Say why the a by maximum likelihood and that by the kurtosis relation differ."""
+    test = result_of(analysis, "kurtosis_of_residuals")
+    return Paragraph(
+        say(
+            "Two values of a stand in this section, and they answer two questions. a = {likelihood} is the law of the residuals, by "
+            "maximum likelihood: all residuals speak, most of them near the middle. a = {kurtosis} is the law of the errors behind them, "
+            "from the kurtosis{value}: the fourth moment listens to the tails, and the mixing of errors by the adjustment, which makes "
+            "residuals more normal than errors, is undone. They would agree if the errors were modulated normal and the redundancy high; "
+            "the farther they part, the less a modulated normal law describes middle and tails at once (gross errors left, or groups of "
+            "different precision).",
+            likelihood=significant(likelihood, 2),
+            kurtosis=significant(kurtosis, 2),
+            value="" if test is None else f" {fixed(float(test.details['kurtosis']), 2)}",
+        )
+    )
+
+
 def _intro(analysis: Analysis, study: AdjustmentLaws) -> str:
     return say(
         "Each residual of {what} ({n}) was divided by its own standard deviation (tau), which makes residuals of good and weak "
         "geometry comparable. A modulated normal law with a = 1/2 is the radico, with a = 1 the lineo, with a = infinity the normal; a "
         "small a means a mixture of precisions: a sharp peak and long tails.",
-        what=study.what,
+        what=tr(study.what),
         n=len(study.values),
     )
 
@@ -141,6 +159,8 @@ def _build(analysis: Analysis) -> list[Block] | None:
         blocks.append(Paragraph(text))
     if study.critical is not None:
         blocks += _critical(study.critical)
+        if laws.modulated is not None:
+            blocks.append(_two_values(analysis, float(laws.modulated.parameters["a"]), float(study.critical.law.parameters["a"])))
     blocks += _moments(analysis)
     if study.scale_rules:
         blocks.append(scale_table(study.scale_rules))

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from baarda.procedures.testing import Analysis
 from baarda.report import plots
+from baarda.report.scene import MOST_POINTS
 from baarda.report.sections._facts import point_sigmas, scaling, spatial
-from baarda.report.sections._numbers import finer, significant
+from baarda.report.sections._numbers import finer, plural, significant
 from baarda.report.sections.base import Block, Figure, SectionMaker, say
+
+
+def _sample(tie: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the points that are drawn: all of the survey, and the others while there is room, else an even sample of them."""
+    others = np.flatnonzero(tie)
+    room = max(MOST_POINTS - int((~tie).sum()), MOST_POINTS // 5)
+    if len(others) > room:
+        others = others[np.linspace(0, len(others) - 1, room).astype(np.intp)]
+    return np.sort(np.concatenate([np.flatnonzero(~tie), others])).astype(np.intp)
 
 
 def _build(analysis: Analysis) -> list[Block] | None:
@@ -20,9 +31,12 @@ def _build(analysis: Analysis) -> list[Block] | None:
     unit = analysis.adjustment.network.unit
     told, factor = finer(unit, whole[whole > 0.0])
     points = np.stack([table[axis] for axis in ("X", "Y", "Z")], axis=1)
+    drawn = _sample(table["role"] == "tie")
     # A camera looks along its -z axis: the third row of M, reversed.
     directions = -images.rotation[:, 2, :]
-    svg = plots.plan(points, whole * factor, table["role"].tolist(), images.position, directions, images.labels, unit, told)
+    svg = plots.plan(
+        points[drawn], (whole * factor)[drawn], table["role"][drawn].tolist(), images.position, directions, images.labels, unit, told
+    )
     free = whole[whole > 0.0] * factor
     sizes = (
         say(" from {low} to {high} {unit}", low=significant(free.min(), 2), high=significant(free.max(), 2), unit=told) if len(free) else ""
@@ -33,6 +47,12 @@ def _build(analysis: Analysis) -> list[Block] | None:
         scaling=scaling(analysis),
         sizes=sizes,
     )
+    low, high = plots.core_of(points[drawn], images.position)
+    out = int((~((points[drawn] >= low) & (points[drawn] <= high)).all(axis=1)).sum())
+    if out:
+        caption += " " + say("{count} outside of the figure, far from the others.", count=plural(out, "point lies", "points lie"))
+    if len(drawn) < len(points):
+        caption += " " + say("Only {shown} points are drawn: those of the survey and an even sample of the others.", shown=len(drawn))
     alt = say(
         "Plan and elevation of {points} object points and {images} images. {caption}",
         points=len(table),

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from baarda.network import AXES
 from baarda.procedures.testing import Analysis
@@ -42,6 +43,38 @@ def _summary(sigmas: np.ndarray, rays: np.ndarray, unit: str, factor: float) -> 
         *(Column(name, unit) for name in measures),
     )
     return DataTable("Precision of the object points", columns, tuple(rows), note)
+
+
+def _expanded(analysis: Analysis, table: Any, sigmas: np.ndarray, unit: str, factor: float) -> DataTable:
+    """Return the expanded uncertainties: coverage factor k, median and largest, for coordinates, position in the plane, and in space."""
+    r, posterior = analysis.adjustment.redundancy, analysis.options.sigma == "aposteriori"
+    law = f"t({r})" if posterior else "N(0, 1)"
+    one = float((stats.t(r) if posterior else stats.norm()).ppf(0.975))
+    regions: list[tuple[str, float, str, np.ndarray]] = [(axis, one, law, one * sigmas[:, k]) for k, axis in enumerate(AXES)]
+    for k, name, key in ((2, "horizontal", "ellipse_a"), (3, "in space", "ellipsoid_a")):
+        size = float(np.sqrt(k * stats.f(k, r).ppf(0.95)) if posterior else np.sqrt(stats.chi2(k).ppf(0.95)))
+        law = f"sqrt({k} F({k}, {r}))" if posterior else f"sqrt(chi2({k}))"
+        regions.append((name, size, law, np.asarray(table[key], dtype=float)))
+    decimals = decimals_for(sigmas[sigmas > 0.0] * factor, 3)
+    rows = []
+    for name, size, law, values in regions:
+        free = values[values > 0.0]
+        if len(free):
+            numbers = [fixed(float(f(free)) * factor, decimals) for f in (np.median, np.max)]
+            rows.append((name, fixed(size, 3), law, *numbers))
+    columns = (
+        Column("of", "", "a coordinate; horizontal and in space: the longest semi-axis of ellipse and ellipsoid", "left"),
+        Column("k", "", "coverage factor: expanded uncertainty U = k s"),
+        Column("law", "", "whose 95 % quantile k is", "left"),
+        Column("median U", unit),
+        Column("largest U", unit),
+    )
+    note = say(
+        "Coverage 95 %, {scaling}. They hold what the a-priori sigmas and the model hold: an error that all observations share, such as a "
+        "wrong scale, is not in them.",
+        scaling=scaling(analysis),
+    )
+    return DataTable("Expanded uncertainties of the object points", columns, tuple(rows), note)
 
 
 def _table(
@@ -89,6 +122,7 @@ def _build(analysis: Analysis) -> list[Block] | None:
         return None
     unit, factor = finer(analysis.adjustment.network.unit, sigmas[sigmas > 0.0])
     blocks: list[Block] = [_summary(sigmas, np.asarray(table["rays"], dtype=float), unit, factor)]
+    blocks.append(_expanded(analysis, table, sigmas, unit, factor))
     worst = free[np.argsort(-whole[free], kind="stable")][:_WORST]
     if len(free) > _WORST:
         blocks.append(_table(analysis, table, sigmas, worst, say("The {count} weakest points", count=len(worst))))

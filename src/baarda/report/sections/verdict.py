@@ -20,7 +20,7 @@ from baarda.report.sections._facts import (
     spatial,
     unit_of,
 )
-from baarda.report.sections._numbers import column, finer, fixed, names, plural, powers, probability, significant
+from baarda.report.sections._numbers import column, finer, fixed, names, p_stated, plural, powers, significant
 from baarda.report.sections.base import Block, SectionMaker, Sentence, Tone, Verdict, say
 from baarda.report.translation import tr
 
@@ -39,7 +39,17 @@ def sentences(analysis: Analysis) -> list[Sentence]:
     """
     if not analysis.converged:
         return [_not_converged(analysis)]
-    parts = (_adjusted, _likelihood, _variance_factor, _parameters, _suspected, _hidden, _precision, _points, _law)
+    parts = (
+        _adjusted if analysis.audit is None else _audited,
+        _likelihood,
+        _variance_factor,
+        _parameters,
+        _suspected,
+        _hidden,
+        _precision,
+        _points,
+        _law,
+    )
     return [s for s in (part(analysis) for part in parts) if s is not None]
 
 
@@ -73,6 +83,40 @@ def _adjusted(analysis: Analysis) -> Sentence:
     return Sentence("Adjustment", text, "good", "data")
 
 
+def _audited(analysis: Analysis) -> Sentence | None:
+    """Say how the source's own solution compares with the minimum, and what its report may hide; instead of the plain sentence."""
+    a, audit = analysis.adjustment, analysis.audit
+    if audit is None:
+        return None
+    group, _, rms, _, _ = max(audit.by_group(), key=lambda g: g[2])
+    far = max(audit.distance, rms)
+    fields = {
+        "value": significant(audit.objective, 5),
+        "excess": significant(100.0 * audit.excess, 2),
+        "least": significant(a.objective, 5),
+        "steps": plural(len(a.history) - 1, "iteration"),
+        "distance": significant(far, 2),
+        "n": a.count,
+        "u": a.numbering.count,
+        "group": tr(group),
+    }
+    text = say(
+        "The source's solution has v'Pv = {value}, {excess} % above the minimum {least} that {steps} reach ({n} observations, {u} "
+        "unknowns); it lies {distance} sigma from there (rms, limit 1): within what the observations can tell."
+        if far <= 1.0
+        else "The source's solution has v'Pv = {value}, {excess} % above the minimum {least} that {steps} reach ({n} observations, {u} "
+        "unknowns); its unknowns of the kind {group} lie {distance} sigma from there (rms, limit 1): it is not the least-squares solution "
+        "of these observations.",
+        **fields,
+    )
+    if audit.conditional_share is not None and audit.conditional_share[0] < 0.9:
+        text += " " + say(
+            "Sigmas of its points with the cameras held fixed would show {share} of the true ones in the median.",
+            share=fixed(audit.conditional_share[0], 2),
+        )
+    return Sentence("Audit", text, "good" if far <= 1.0 else "warn" if far <= 3.0 else "bad", "audit")
+
+
 def _likelihood(analysis: Analysis) -> Sentence | None:
     """Say which law of errors the adjustment took, and what it resists: under a law most tests do not apply."""
     law = analysis.adjustment.law
@@ -104,40 +148,40 @@ def _variance_factor(analysis: Analysis) -> Sentence | None:
     return Sentence("Variance factor", say(text, **fields), "bad" if test.rejected else "good", "tests")
 
 
+#: Of networks with cameras, and of others (antenna tracks): the only one, all, and some are (not) significant.
+_ADDITIONAL = {
+    True: (
+        "The only additional camera parameter, {name}, differs significantly from zero at level {alpha} (|t| = {t}, limit {limit}).",
+        "All {count} additional camera parameters differ significantly from zero at level {alpha} (smallest |t| = {t} for {name}, limit "
+        "{limit}).",
+        "{weak} of {count} additional camera parameters {verb} not differ significantly from zero at level {alpha} (|t| below {limit}): "
+        "{names}; the model may do without.",
+    ),
+    False: (
+        "The only additional parameter, {name}, differs significantly from zero at level {alpha} (|t| = {t}, limit {limit}).",
+        "All {count} additional parameters differ significantly from zero at level {alpha} (smallest |t| = {t} for {name}, limit {limit}).",
+        "{weak} of {count} additional parameters {verb} not differ significantly from zero at level {alpha} (|t| below {limit}): {names}; "
+        "the model may do without.",
+    ),
+}
+
+
 def _parameters(analysis: Analysis) -> Sentence | None:
     test = result_of(analysis, "additional_parameter")
     if test is None or not isinstance(test.critical, tuple):
         return None
     weak, tested = insignificant(analysis)
+    cameras = bool(analysis.adjustment.network.cameras)
+    title, place = ("Camera model", "cameras") if cameras else ("Additional parameters", "other-unknowns")
+    only, every, some = _ADDITIONAL[cameras]
     fields = {"count": len(tested), "alpha": f"{test.alpha:.3g}", "limit": fixed(test.critical[1], 2)}
     size = np.abs(np.asarray(test.statistic))
     if not weak:
         i = int(np.argmin(size))
-        if len(tested) == 1:
-            template = (
-                "The only additional camera parameter, {name}, differs significantly from zero at level {alpha} (|t| = {t}, limit {limit})."
-            )
-        else:
-            template = (
-                "All {count} additional camera parameters differ significantly from zero at level {alpha} (smallest |t| = {t} for {name}, "
-                "limit {limit})."
-            )
-        text = say(
-            template,
-            t=significant(size[i], 3),
-            name=bare(tested[i], analysis),
-            **fields,
-        )
-        return Sentence("Camera model", text, "good", "cameras")
-    text = say(
-        "{weak} of {count} additional camera parameters {verb} not differ significantly from zero at level {alpha} (|t| below {limit}): "
-        "{names}; the model may do without.",
-        weak=len(weak),
-        verb="does" if len(weak) == 1 else "do",
-        names=names(weak, 6),
-        **fields,
-    )
-    return Sentence("Camera model", text, "warn", "cameras")
+        text = say(only if len(tested) == 1 else every, t=significant(size[i], 3), name=bare(tested[i], analysis), **fields)
+        return Sentence(title, text, "good", place)
+    text = say(some, weak=len(weak), verb="does" if len(weak) == 1 else "do", names=names(weak, 6), **fields)
+    return Sentence(title, text, "warn", place)
 
 
 def _suspected(analysis: Analysis) -> Sentence | None:
@@ -258,7 +302,7 @@ def _precision(analysis: Analysis) -> Sentence | None:
     unit, factor = finer(analysis.adjustment.network.unit, sigmas[sigmas > 0.0])
     known = np.append(medians, whole[weakest]) * factor
     told = iter(column(known[np.isfinite(known)], 2))
-    shown = [next(told) if np.isfinite(value) else "fixed" for value in known]
+    shown = [next(told) if np.isfinite(value) else tr("fixed") for value in known]
     text = say(
         "The object points have standard deviations of {x} / {y} / {z} {unit} in X / Y / Z (medians, {scaling}); the weakest is point "
         "{name} with {most} {unit} in space.",
@@ -359,14 +403,14 @@ def _law(analysis: Analysis) -> Sentence | None:
             "chi-square {chi}, limit {limit}, p {p} for independent values",
             chi=fixed(normal.statistic, 1),
             limit=fixed(normal.critical, 1),
-            p=_p_word(normal.p_value),
+            p=p_stated(normal.p_value),
         )
     else:
         test = say(
             "Anderson-Darling {value}, limit {limit}, p {p} by simulated adjustments",
             value=fixed(float(simulated.statistic), 2),
             limit=fixed(_upper(simulated.critical), 2),
-            p=_p_word(float(simulated.p_value)),
+            p=p_stated(float(simulated.p_value)),
         )
     more = ""
     if not rejected:
@@ -385,11 +429,6 @@ def _law(analysis: Analysis) -> Sentence | None:
     tone: Tone = "warn" if rejected else "good"
     name = law_name(best.law, best.parameters.get("a"))
     return Sentence("Law of residuals", say(text, test=test, best=name) + (say(more, best=name) if more else ""), tone, "law")
-
-
-def _p_word(p: float | None) -> str:
-    text = probability(p)
-    return text if text.startswith("<") else f"= {text}"
 
 
 def law_name(law: str, a: float | None = None) -> str:
