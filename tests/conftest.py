@@ -2,6 +2,8 @@
 
 import inspect
 import os
+import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -11,12 +13,20 @@ settings.register_profile("baarda", deadline=None, derandomize=True)  # no timed
 settings.load_profile("baarda")
 
 HERE = Path(__file__).parent
+EXTRAS = re.compile(r'importorskip\("(pyarrow|pyproj|typst|fsspec)|^ *import distributed', re.MULTILINE)
 SHARED = Path(os.environ.get("BAARDA_DATA", HERE.parent.parent / "shared" / "data"))
 
 
+@cache
+def needs_an_extra(path: Path) -> bool:
+    return path.suffix == ".py" and EXTRAS.search(path.read_text(encoding="utf-8")) is not None
+
+
 def pytest_collection_modifyitems(items):
-    """Mark the tests that skip without an oracle, so that a second run can be confined to them."""
+    """Mark the tests that skip without an oracle or an extra, so that a second run can be confined to them."""
     for item in items:
+        if needs_an_extra(item.path):
+            item.add_marker("extra")
         function = getattr(item, "function", None)
         reasons = [str(m.kwargs.get("reason", "")) for m in item.iter_markers("skipif")]
         if any("the oracle" in r for r in reasons) or (function is not None and "the oracle" in inspect.getsource(function)):
