@@ -35,9 +35,7 @@ def geocentric(lla: Floats, a: float = A, f: float = F) -> Floats:
     e2 = f * (2.0 - f)
     lat, lon, h = np.radians(lla[..., 0]), np.radians(lla[..., 1]), lla[..., 2]
     n = a / np.sqrt(1.0 - e2 * np.sin(lat) ** 2)
-    return np.stack(
-        [(n + h) * np.cos(lat) * np.cos(lon), (n + h) * np.cos(lat) * np.sin(lon), (n * (1.0 - e2) + h) * np.sin(lat)], axis=-1
-    )
+    return np.stack([(n + h) * np.cos(lat) * np.cos(lon), (n + h) * np.cos(lat) * np.sin(lon), (n * (1.0 - e2) + h) * np.sin(lat)], axis=-1)
 
 
 @dataclass(frozen=True)
