@@ -4,6 +4,7 @@ import inspect
 import os
 import re
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,9 @@ def needs_an_extra(path: Path) -> bool:
 def pytest_collection_modifyitems(items):
     """Mark the tests that skip without an oracle or an extra, so that a second run can be confined to them."""
     for item in items:
+        if isinstance(item, pytest.DoctestItem) and ">>> from pyarrow" in (item.dtest.docstring or ""):
+            item.add_marker("extra")
+            item.add_marker(pytest.mark.skipif(find_spec("pyarrow") is None, reason="the example needs the extra 'tables'"))
         if needs_an_extra(item.path):
             item.add_marker("extra")
         function = getattr(item, "function", None)
