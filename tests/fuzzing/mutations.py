@@ -250,7 +250,10 @@ def _json(data: bytes, rng: random.Random) -> bytes:
         parent[key] = {str(key): at}
     elif kind == 5:
         other, place = rng.choice(way)
-        parent[key] = copy.deepcopy(other[place]) if other is not parent else None
+        try:
+            parent[key] = copy.deepcopy(other[place]) if other is not parent else None
+        except RecursionError:  # earlier damage nested it too deeply
+            parent[key] = None
     elif kind == 6:
         for _ in range(rng.choice((5, 60, 900))):
             at = [at]

@@ -199,3 +199,20 @@ def test_messages_end_and_steer_no_terminal(kind):
 
 def test_shown_leaves_plain_text_alone():
     assert shown("Tür 12: α = 0.05\nnext line") == "Tür 12: α = 0.05\nnext line"
+
+
+def test_an_element_larger_than_the_file(tmp_path):
+    path = tmp_path / "v.npy"
+    path.write_bytes(header((2,), "'<U420000000'") + bytes(64))
+    with pytest.raises(InputError):
+        read_residuals(path)
+
+
+def test_a_count_of_colmap_with_thousands_of_digits(tmp_path):
+    for name, text in (
+        ("cameras.txt", f"# Number of cameras: {'9' * 5000}\n1 PINHOLE 100 100 90 90 50 50\n"),
+        ("images.txt", "1 1 0 0 0 0 0 0 1 a.jpg\n50 50 1\n2 1 0 0 0 1 0 0 1 b.jpg\n40 50 1\n"),
+        ("points3D.txt", "1 0 0 9 0 0 0 0 1 0 2 0\n"),
+    ):
+        (tmp_path / name).write_text(text)
+    assert read(tmp_path).cameras[0].label == "1"

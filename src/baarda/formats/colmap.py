@@ -102,7 +102,7 @@ def _lines(path: Path, what: str) -> tuple[list[str], int | None]:
     for line in lines:
         if not line.startswith("#"):
             break
-        found = re.match(rf"#\s*Number of {what}:\s*(\d+)", line)
+        found = re.match(rf"#\s*Number of {what}:\s*(\d{{1,15}})(?!\d)", line)
         announced = int(found[1]) if found else announced
     return lines, announced
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,8 @@ def map_array(file: Path) -> np.ndarray[Any, Any]:
     Raises
     ------
     ValueError
-        If the elements have no size (NumPy divides by it and the process ends) or are Python objects; what else damaged headers end in is
-        listed in `baarda.formats.residual_table.HEADER_ERRORS`.
+        If the elements have no size (NumPy divides by it and the process ends) or are Python objects, or the file holds less than its
+        header says; what else damaged headers end in is listed in `baarda.formats.residual_table.HEADER_ERRORS`.
 
     Examples
     --------
@@ -45,5 +46,7 @@ def map_array(file: Path) -> np.ndarray[Any, Any]:
             raise ValueError(f"its elements ({dtype}) have no size")
         if any(type(n) is not int or n < 0 for n in shape):
             raise ValueError(f"{shape} is not the shape of an array")
+        if dtype.itemsize * math.prod(shape) > file.stat().st_size:  # an element may be announced larger than memory
+            raise ValueError("its header announces more than the file holds")
         mapped: np.ndarray[Any, Any] = np.load(file, mmap_mode="r", allow_pickle=False)
     return mapped
