@@ -208,6 +208,13 @@ def test_an_element_larger_than_the_file(tmp_path):
         read_residuals(path)
 
 
+def test_a_header_longer_than_the_file(tmp_path):
+    path = tmp_path / "v.npy"
+    path.write_bytes(b"\x93NUMPY\x02\x00" + struct.pack("<I", 1_680_308_992) + b"{'descr': '<f8'".ljust(595))
+    with pytest.raises(InputError, match="beyond the file"):
+        read_residuals(path)
+
+
 def test_a_count_of_colmap_with_thousands_of_digits(tmp_path):
     for name, text in (
         ("cameras.txt", f"# Number of cameras: {'9' * 5000}\n1 PINHOLE 100 100 90 90 50 50\n"),

@@ -40,6 +40,12 @@ def map_array(file: Path) -> np.ndarray[Any, Any]:
         warnings.simplefilter("ignore")  # of headers that Python 2 wrote
         with file.open("rb") as f:
             version = np.lib.format.read_magic(f)
+            if version != (1, 0):
+                begin = f.tell()
+                length = int.from_bytes(f.read(4), "little")
+                if length > file.stat().st_size:  # NumPy would ask for that much memory
+                    raise ValueError("its header ends beyond the file")
+                f.seek(begin)
             read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
             shape, _, dtype = read_header(f)
         if dtype.itemsize == 0:
