@@ -27,6 +27,106 @@ NEAR = 1e-3  # relative step below which a full step is not tried before it is t
 BEND = 1e-7  # relative step above which steps are bent
 
 
+class Control:
+    """What decides about steps: how they are damped, which are taken, and when to stop.
+
+    The damping follows Nielsen's rule (1999).
+
+    Parameters
+    ----------
+    objective : float
+        v'Pv at the start.
+    count : int
+        Number of observations.
+    settings : Settings
+    progress : callable, optional
+        Is told every iteration.
+
+    Attributes
+    ----------
+    damping : float
+        Of the next step; 0 = a full Gauss-Newton step.
+    history : list of Iteration
+    """
+
+    def __init__(self, objective: float, count: int, settings: Settings, progress: Callable[[Iteration], None] | None = None) -> None:
+        self.objective, self.tolerance, self.progress = objective, settings.tolerance, progress
+        self.floor = count * 1e-8  # residuals of 1e-4 sigma count as none
+        self.history = [Iteration(0, objective, None, 0.0, True)]
+        self.damping = 0.0
+        self._growth, self._last, self._curved = 2.0, np.inf, False
+        self._stalled, self._trusted, self._gain = 0, False, 0.0
+
+    @property
+    def reuses(self) -> bool:
+        """Whether the factor of the last iteration serves the next one."""
+        return self.damping == 0.0 and self._last <= REUSE
+
+    def relative(self, squares: float) -> float:
+        """Return the size of a step whose changes of the observations have this sum of squares, relative to the residuals."""
+        return float(np.sqrt(squares / max(self.objective, self.floor)))
+
+    def bends(self, relative: float) -> bool:
+        """Return whether a step is to be bent: not one that is tiny or shrinks fast."""
+        return relative > max(BEND, 0.1 * self._last if np.isfinite(self._last) else 0.0)
+
+    def near(self, relative: float) -> bool:
+        """Return whether a step is as good as sure to be taken."""
+        return self.damping == 0.0 and (relative <= NEAR or self._trusted)
+
+    def takes(self, value: float, predicted: float, relative: float) -> bool:
+        """Judge a step by the v'Pv that it reaches and was predicted to save; write the history; damp more where it is refused."""
+        gain = (self.objective - value) / predicted if predicted > 0.0 else 0.0
+        at_rounding = relative < 1e-6 and abs(value - self.objective) <= 1e-9 * max(self.objective, self.floor)
+        accepted = bool(gain > 1e-4 or at_rounding)
+        self._trusted, self._gain = self.damping == 0.0 and gain > 0.5, gain
+        self.history.append(Iteration(len(self.history), value if accepted else self.objective, relative, self.damping, accepted))
+        if self.progress is not None:
+            self.progress(self.history[-1])
+        if accepted:
+            self.objective = value
+            return True
+        self._curved |= relative < 1e-3  # large residuals bend the problem so much that full steps fail even beside the solution
+        self.damping = max(self.damping * self._growth, 1e-4 if relative > 0.1 else 1e-7)
+        self._growth, self._last = 2.0 * self._growth, np.inf
+        return False
+
+    def settled(self, relative: float, plain: bool) -> bool:
+        """Return whether nothing is left after an accepted step; `plain`: neither it nor the last one was bent or lengthened."""
+        self._stalled = self._stalled + 1 if relative <= 1e-7 and relative >= 0.8 * self._last else 0
+        rate = 10.0 * relative / self._last if plain else 1.0
+        left = relative * min(rate, 1.0)  # the next step by the rate of the last two, with caution
+        rounding = relative < 1e-9 and relative >= 0.5 * self._last  # only that is left
+        return left <= self.tolerance or self._stalled == 2 or rounding
+
+    def relax(self, relative: float) -> None:
+        """Damp less after an accepted step."""
+        self.damping *= max(0.5 if self._curved else 0.2, 1.0 - (2.0 * min(self._gain, 1.0) - 1.0) ** 3)
+        if self.damping < 1e-9 or (relative < 1e-4 and not self._curved):
+            self.damping = 0.0
+        self._growth, self._last = 2.0, relative
+
+
+def extrapolation(product: float, before: float, now: float) -> float:
+    """Return by how much to lengthen a step that repeats the last one at a constant rate (Aitken's extrapolation), else 1.
+
+    Parameters
+    ----------
+    product, before, now : float
+        Of the changes of the observations by both steps: their product, and the sums of squares of the last and of this one.
+
+    Examples
+    --------
+    >>> extrapolation(0.5, 1.0, 0.25)
+    2.0
+    >>> extrapolation(0.0, 1.0, 0.25)
+    1.0
+    """
+    rate = product / before
+    alike = product**2 > 0.8 * before * now
+    return 1.0 / (1.0 - rate) if alike and 0.1 < abs(rate) < 0.97 else 1.0
+
+
 def iterate(
     network: Network,
     state: State,
@@ -38,15 +138,11 @@ def iterate(
 ) -> tuple[State, Linearization, list[Iteration], bool]:
     """Gauss-Newton with Levenberg's damping where a full step does not help.
 
-    The damping follows Nielsen's rule (1999). Steps that shrink at a constant rate, as large residuals make them, are extrapolated
-    (Aitken); others are bent by the second derivative along them, solved with the same factor (geodesic acceleration: Transtrum &
-    Sethna 2012), so that narrow curved valleys of weak self-calibrations are followed, not crept along.
+    Steps that shrink at a constant rate, as large residuals make them, are extrapolated; others are bent by the second derivative along
+    them, solved with the same factor (geodesic acceleration: Transtrum & Sethna 2012), so that narrow curved valleys of weak
+    self-calibrations are followed, not crept along.
     """
-    objective = float(lin.misclosure @ lin.misclosure)
-    floor = lin.count * 1e-8  # residuals of 1e-4 sigma count as none
-    history = [Iteration(0, objective, None, 0.0, True)]
-    damping, growth, last, curved = 0.0, 2.0, np.inf, False
-    stalled, trusted = 0, False
+    control = Control(float(lin.misclosure @ lin.misclosure), lin.count, settings, settings.progress)
     before: Floats | None = None  # the last full step, as a change of the observations
 
     def moved(step: Floats) -> State:
@@ -61,24 +157,23 @@ def iterate(
     tied, unknowns, workers = datum, lin.unknowns, lin.workers
     untied = replace(datum, held=np.zeros(0, dtype=np.intp), conditions=None)  # damping ties the datum down by itself
     solver: Solver | None = None
-    for count in range(1, settings.iterations + 1):
-        datum = untied if damping > 0.0 else tied
-        if solver is not None and damping == 0.0 and last <= REUSE:
+    for _ in range(settings.iterations):
+        datum = untied if control.damping > 0.0 else tied
+        if solver is not None and control.reuses:
             solver = solver.at(lin)  # the system hardly differs from the one that was factored
         else:
-            solver = factor(lin, datum, damping)
+            solver = factor(lin, datum, control.damping)
         step, change = _step(lin, solver, datum, lin.misclosure)
-        predicted = 2.0 * float(change @ lin.misclosure) - float(change @ change)
-        relative = float(np.linalg.norm(change) / np.sqrt(max(objective, floor)))
-        lengthened, plain = 1.0, before is not None
-        if damping == 0.0 and before is not None and relative < 0.01:
-            lengthened = _extrapolated(change, before)
+        squares = float(change @ change)
+        relative, lengthened, plain = control.relative(squares), 1.0, before is not None
+        if control.damping == 0.0 and before is not None and relative < 0.01:
+            lengthened = extrapolation(float(change @ before), float(before @ before), squares)
             step, plain = lengthened * step, lengthened == 1.0
-            predicted = 2.0 * lengthened * float(change @ lin.misclosure) - lengthened**2 * float(change @ change)
-        if lengthened == 1.0 and relative > max(BEND, 0.1 * last if np.isfinite(last) else 0.0):  # steps that shrink fast need no bending
+        predicted = 2.0 * lengthened * float(change @ lin.misclosure) - lengthened**2 * squares
+        if lengthened == 1.0 and control.bends(relative):
             step, plain = _bent(lin, solver, datum, step, change, lambda x: misclosures(x)[1]), False
-        near = damping == 0.0 and (relative <= NEAR or trusted)
-        if near:  # as good as sure to be taken: linearised at once
+        near = control.near(relative)
+        if near:  # linearised at once
             trial, solver = moved(step), solver.at(None)
             del lin  # its memory is needed
             lin = linearize(network, trial, unknowns, groups, workers)
@@ -86,37 +181,22 @@ def iterate(
                 value = float(lin.misclosure @ lin.misclosure)
         else:
             trial, _, value = misclosures(step)
-        gain = (objective - value) / predicted if predicted > 0.0 else 0.0
-        at_rounding = relative < 1e-6 and abs(value - objective) <= 1e-9 * max(objective, floor)
-        accepted = bool(gain > 1e-4 or at_rounding)
-        trusted = damping == 0.0 and gain > 0.5
-        history.append(Iteration(count, value if accepted else objective, relative, damping, accepted))
-        if settings.progress is not None:
-            settings.progress(history[-1])
-        if not accepted:
+        full = control.damping == 0.0
+        if not control.takes(value, predicted, relative):
             before = solver = None
             if near:
                 lin = linearize(network, state, unknowns, groups, workers)
-            curved |= relative < 1e-3  # large residuals bend the problem so much that full steps fail even beside the solution
-            damping, growth, last = max(damping * growth, 1e-4 if relative > 0.1 else 1e-7), 2.0 * growth, np.inf
             continue
-        state, objective = trial, value
-        before = change if damping == 0.0 and lengthened == 1.0 else None
-        solver = solver.at(None) if solver is not None and damping == 0.0 and relative <= REUSE else None
+        state = trial
+        before = change if full and lengthened == 1.0 else None
+        solver = solver.at(None) if full and relative <= REUSE else None
         if not near:
             del lin
             lin = linearize(network, state, unknowns, groups, workers)
-        stalled = stalled + 1 if relative <= 1e-7 and relative >= 0.8 * last else 0
-        rate = 10.0 * relative / last if plain else 1.0
-        left = relative * min(rate, 1.0)  # the next step by the rate of the last two, if they were plain ones, with caution
-        settled = left <= settings.tolerance or stalled == 2 or (relative < 1e-9 and relative >= 0.5 * last)  # only rounding is left
-        if settled and (damping == 0.0 or _full_step(lin, tied, factor) <= 1e-6):
-            return state, lin, history, True
-        damping *= max(0.5 if curved else 0.2, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
-        if damping < 1e-9 or (relative < 1e-4 and not curved):
-            damping = 0.0
-        growth, last = 2.0, relative
-    return state, lin, history, False
+        if control.settled(relative, plain) and (full or _full_step(lin, tied, factor) <= 1e-6):
+            return state, lin, control.history, True
+        control.relax(relative)
+    return state, lin, control.history, False
 
 
 def _step(lin: Linearization, solver: Solver, datum: Datum, y: Floats) -> tuple[Floats, Floats]:
@@ -126,14 +206,6 @@ def _step(lin: Linearization, solver: Solver, datum: Datum, y: Floats) -> tuple[
         return step, change
     step = datum.transform(step)
     return step, lin.times(step)  # the free transformations are those of the start values: they change the observations a little
-
-
-def _extrapolated(change: Floats, before: Floats) -> float:
-    """Return by how much to lengthen a step that repeats the last one at a constant rate (Aitken's extrapolation), else 1."""
-    product, square = float(change @ before), float(before @ before)
-    rate = product / square
-    alike = product**2 > 0.8 * square * float(change @ change)
-    return 1.0 / (1.0 - rate) if alike and 0.1 < abs(rate) < 0.97 else 1.0
 
 
 def centres_of_rays(groups: Sequence[Kind], state: State) -> Floats:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from baarda.adjustment.iteration import BEND, NEAR, REUSE
+from baarda.adjustment.iteration import REUSE, Control, extrapolation
 from baarda.adjustment.result import Iteration
 from baarda.adjustment.solve import Settings
 from baarda.errors import RedundancyNotPositive, UsageError
@@ -133,67 +133,39 @@ class Run:
                 f"redundancy {redundancy}: n = {joint.count} observations, u = {joint.unknowns} unknowns, "
                 f"datum defect d = {tied.count}; a test needs r = n - u + d > 0"
             )
-        objective = sum(f.objective for f in joint.facts)
-        floor = joint.count * 1e-8
-        history = [Iteration(0, objective, None, 0.0, True)]
-        damping, growth, last, curved = 0.0, 2.0, np.inf, False
-        stalled, trusted, converged = 0, False, False
+        control = Control(sum(f.objective for f in joint.facts), joint.count, settings, self.progress)
+        converged = False
         before: Handles | None = None
         old: Handles | None = None
-        for count in range(1, settings.iterations + 1):
-            datum = None if damping > 0.0 else tied
-            self.factor(datum, damping, old if damping == 0.0 and last <= REUSE else None)
+        for _ in range(settings.iterations):
+            datum = None if control.damping > 0.0 else tied
+            self.factor(datum, control.damping, old if control.reuses else None)
             old = None
             steps = self.solved(datum)
             s = self.sums(steps, before)
-            predicted, relative, lengthened = 2.0 * s.cl - s.cc, float(np.sqrt(s.cc / max(objective, floor))), 1.0
-            plain = before is not None
-            if damping == 0.0 and before is not None and relative < 0.01:
-                lengthened = _extrapolated(s)
+            relative, lengthened, plain = control.relative(s.cc), 1.0, before is not None
+            if control.damping == 0.0 and before is not None and relative < 0.01:
+                lengthened = extrapolation(s.cb, s.bb, s.cc)
                 plain = lengthened == 1.0
-                predicted = 2.0 * lengthened * s.cl - lengthened**2 * s.cc
-            full = steps
-            if lengthened == 1.0 and relative > max(BEND, 0.1 * last if np.isfinite(last) else 0.0):
+            predicted = 2.0 * lengthened * s.cl - lengthened**2 * s.cc
+            unbent, full = steps, control.damping == 0.0
+            if lengthened == 1.0 and control.bends(relative):
                 steps, plain = self.bent(datum, steps), False
-            near = damping == 0.0 and (relative <= NEAR or trusted)
-            trials = parts.each(tasks.tried, self.stands, steps, lengthened, near)
+            trials = parts.each(tasks.tried, self.stands, steps, lengthened, control.near(relative))
             value = float(sum(parts.all(tasks.objective_of, trials)))
-            gain = (objective - value) / predicted if predicted > 0.0 else 0.0
-            at_rounding = relative < 1e-6 and abs(value - objective) <= 1e-9 * max(objective, floor)
-            accepted = bool(gain > 1e-4 or at_rounding)
-            trusted = damping == 0.0 and gain > 0.5
-            history.append(Iteration(count, value if accepted else objective, relative, damping, accepted))
-            if self.progress is not None:
-                self.progress(history[-1])
-            if not accepted:
+            if not control.takes(value, predicted, relative):
                 before = None
-                curved |= relative < 1e-3
-                damping, growth, last = max(damping * growth, 1e-4 if relative > 0.1 else 1e-7), 2.0 * growth, np.inf
                 continue
-            objective = value
-            before = full if damping == 0.0 and lengthened == 1.0 else None
-            if damping == 0.0 and relative <= REUSE:
+            before = unbent if full and lengthened == 1.0 else None
+            if full and relative <= REUSE:
                 old = self.stands
             self.stands = parts.each(tasks.stand_of, trials)
-            del trials, steps, full
-            stalled = stalled + 1 if relative <= 1e-7 and relative >= 0.8 * last else 0
-            rate = 10.0 * relative / last if plain else 1.0
-            settled = relative * min(rate, 1.0) <= settings.tolerance or stalled == 2 or (relative < 1e-9 and relative >= 0.5 * last)
-            if settled and (damping == 0.0 or self.full_step(self.stands, tied, objective) <= 1e-6):
+            del trials, steps, unbent
+            if control.settled(relative, plain) and (full or self.full_step(self.stands, tied, control.objective) <= 1e-6):
                 converged = True
                 break
-            damping *= max(0.5 if curved else 0.2, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
-            if damping < 1e-9 or (relative < 1e-4 and not curved):
-                damping = 0.0
-            growth, last = 2.0, relative
+            control.relax(relative)
         old = before = None
         datum = choose_datum(parts, self.stands, settings, False) if tied.count else tied
         self.factor(datum, 0.0, None)
-        return Blocked(joint, datum, self.stands, self.top, objective, redundancy, tuple(history), converged)
-
-
-def _extrapolated(s: tasks.StepSums) -> float:
-    """Return by how much to lengthen a step that repeats the last one at a constant rate (Aitken's extrapolation), else 1."""
-    rate = s.cb / s.bb
-    alike = s.cb**2 > 0.8 * s.bb * s.cc
-    return 1.0 / (1.0 - rate) if alike and 0.1 < abs(rate) < 0.97 else 1.0
+        return Blocked(joint, datum, self.stands, self.top, control.objective, redundancy, tuple(control.history), converged)
