@@ -71,7 +71,7 @@ def statistics(result: Any, afresh: bool = False) -> Any:
         if afresh:
             network = result.network.shifted(result.shift)
             state, rank = State.of(network), rank_of_points(result.start.shifted(result.shift).points.coordinates)
-            lin = linearize(network, state, result.numbering, Arrangement.of(result.groups, rank))
+            lin = linearize(network, state, result.numbering, Arrangement.of(result.groups, rank, network))
             structure = analyse(lin, rank, state.points)
         solver = BlockSolver.of(lin, structure, result.datum.held)
     found = replace(result, lin=lin, solver=solver)

@@ -42,13 +42,14 @@ def one_thread_for_blas():
         yield
 
 
-@pytest.fixture(params=["twins", "compiled"])
+@pytest.fixture(params=["twins", "compiled", "evaluated"])
 def loops(request, monkeypatch):
-    """Everything by NumPy, or everything by compiled loops."""
-    if request.param == "compiled" and kernels.compiled() is None:
+    """Everything by NumPy, everything by compiled loops, or these with partials that are evaluated wherever they are needed."""
+    if request.param != "twins" and kernels.compiled() is None:
         pytest.skip("numba is not installed")
     for module in SWITCHES:
-        monkeypatch.setattr(module, "COMPILE_FROM", 0 if request.param == "compiled" else 10**9)
+        monkeypatch.setattr(module, "COMPILE_FROM", 10**9 if request.param == "twins" else 0)
+    monkeypatch.setattr("baarda.adjustment.linearize.EVALUATED_FROM", 0 if request.param == "evaluated" else 10**9)
     return request.param
 
 
@@ -216,7 +217,7 @@ def system(network, workers_=None, min_rays=0, **options):
     unknowns = unknowns_of(network, ~aside, np.isin(np.arange(len(network.cameras)), network.images.cameras))
     state = State.of(network)
     rank = rank_of_points(state.points)
-    lin = linearize(network, state, unknowns, Arrangement.of(groups, rank), workers_)
+    lin = linearize(network, state, unknowns, Arrangement.of(groups, rank, network), workers_)
     pattern = analyse(lin, rank, state.points)
     datum = choose_datum(find_defect(lin, state), lin, settings, network)
     return System(lin, pattern, datum.held, lin.transposed(lin.misclosure), state.points)
@@ -485,13 +486,31 @@ def test_cut_out_of_real_images(data, monkeypatch):
         against_dense_solver(s)
 
 
+@pytest.mark.parametrize("name", list(NETWORKS))
+def test_evaluated_partials_are_the_stored_ones(name, monkeypatch):
+    if kernels.compiled() is None:
+        pytest.skip("numba is not installed")
+    for module in SWITCHES:
+        monkeypatch.setattr(module, "COMPILE_FROM", 0)
+    stored = system(NETWORKS[name]()).lin
+    monkeypatch.setattr("baarda.adjustment.linearize.EVALUATED_FROM", 0)
+    evaluated = system(NETWORKS[name]()).lin
+    assert stored.stored
+    assert evaluated.stored == (name == "correlated")
+    roots = 1.0 + np.arange(stored.count) % 7
+    for a, b in ((stored, evaluated), (stored.weighted(roots), evaluated.weighted(roots)), (stored.sample(50), evaluated.sample(50))):
+        np.testing.assert_array_equal(a.misclosure, b.misclosure)
+        assert abs(a.design - b.design).max() <= 1e-15 * abs(a.design).max()
+    np.testing.assert_allclose(stored.scale, evaluated.scale, rtol=1e-14)
+
+
 # ---- threads ----
 @pytest.mark.parametrize("name", ["aerial", "joined points", "dense", "several groups"])
 def test_threads_change_no_bit(name, loops, monkeypatch):
     network = NETWORKS[name]()
     monkeypatch.setattr("baarda.adjustment.linear_system.PIECE", 97)
     monkeypatch.setattr("baarda.observations.image_points.CHUNK", 101)
-    monkeypatch.setattr("baarda.adjustment.structure.TASK", 103)
+    monkeypatch.setattr("baarda.adjustment.structure.RUN", 103)
     results = []
     for count in (1, 2, 3):
         monkeypatch.setattr(workers, "worker_count", lambda _, count=count: count)

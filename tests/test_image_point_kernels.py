@@ -21,7 +21,7 @@ PROGRAMMED = [
 ]
 
 
-def block(name, seed=0):
+def block(name, seed=0, points=30):
     """A ring of images with a camera of this model, every additional parameter away from zero."""
     rng = np.random.default_rng(seed)
     model = cameras.model(name)
@@ -36,7 +36,7 @@ def block(name, seed=0):
             values[p.name] = 396.0
         else:  # effects of some pixels whatever the power of the unit
             values[p.name] = p.default + 1e-2 * rng.standard_normal() * size**p.power
-    network = ring(images=5, points=30, free=(), seed=seed)
+    network = ring(images=5, points=points, free=(), seed=seed)
     camera = cameras.create("1", model, values, free=model.order, image_size=(1000.0, 800.0))
     return replace(network, cameras=(camera,))
 
@@ -163,3 +163,104 @@ def test_other_models_are_evaluated_by_numpy(monkeypatch):
         group = changed.observations[0]
         piece = group.pieces(changed)[0]
         assert group._compiled(piece, changed, State.of(changed), partials=True) is None
+
+
+def rows(network, begin, end, plane="image", keep_camera=None, keep_image=range(6), weights=None, kind=np.int64):
+    """Evaluate rows begin ... end - 1 by the compiled loop itself: what it returns, and its four results."""
+    group, state, optics = network.observations[0], State.of(network), Optics.of(network.cameras[0])
+    program, k = kernels.Program.of(optics), len(optics.model.order)
+    keep_camera = np.arange(k) if keep_camera is None else np.array(keep_camera, dtype=np.intp)
+    keep_image, n = np.array(keep_image, dtype=np.intp), end - begin
+    out = [np.full(s, np.nan) for s in ((n, 2), (n, 2, len(keep_camera)), (n, 2, len(keep_image)), (n, 2, 3))]
+    failed = kernels.compiled()(
+        program.steps, program.places, program.measured, plane == "corrected", np.array([1.0, -1.0]), optics.pixel_size, optics.origin,
+        state.camera_table(k), state.rotation, state.position, state.points, network.images.cameras, group.images.astype(kind),
+        group.points.astype(kind), group.xy, np.ones((1, 2)) if weights is None else weights, begin, end, True, keep_camera, keep_image,
+        *out,
+    )  # fmt: skip
+    return failed, out
+
+
+def two_cameras(name):
+    """A block of several batches of rows in which some batches have one camera and others two."""
+    network = block(name, points=150)
+    second = replace(network.cameras[0].with_values(network.cameras[0].values * (1.0 + 1e-3)), label="2")
+    group = network.observations[0]
+    order = np.argsort(group.images[: len(group)], kind="stable")
+    images = replace(network.images, cameras=np.array([0, 0, 1, 0, 1]))
+    return replace(network, cameras=(network.cameras[0], second), images=images, observations=(group.selected(order),))
+
+
+@pytest.mark.parametrize("name, plane", [("RADIAL", "image"), ("FULL_OPENCV", "image"), ("brown", "image"), ("brown", "corrected")])
+def test_a_row_does_not_depend_on_where_a_call_begins(name, plane):
+    network = two_cameras(name)
+    n = len(network.observations[0])
+    assert n > 4 * kernels.BATCH
+    weights = 1.0 + np.random.default_rng(3).random((n, 2))
+    failed, whole = rows(network, 0, n, plane, weights=weights)
+    assert failed == -1
+    assert all(np.isfinite(x).all() for x in whole)
+    for sizes in ([1, 2, 3, 5, 7, 8, 9, 31], [kernels.BATCH - 1, kernels.BATCH + 1, 17], [n - 1, 1]):
+        begin = 0
+        while begin < n:
+            for size in sizes:
+                end = min(n, begin + size)
+                failed, part = rows(network, begin, end, plane, weights=weights)
+                assert failed == -1
+                for a, b in zip(part, whole, strict=True):
+                    assert a.tobytes() == np.ascontiguousarray(b[begin:end]).tobytes()
+                begin = end
+
+
+@pytest.mark.parametrize("name", ["RADIAL", "FULL_OPENCV", "brown"])
+def test_only_the_partials_to_keep(name):
+    network = two_cameras(name)
+    n, k = len(network.observations[0]), len(network.cameras[0].model.order)
+    _, whole = rows(network, 0, n)
+    for keep in ([], [k - 1], [0, 3], range(1, k)):
+        _, some = rows(network, 0, n, keep_camera=keep, keep_image=[1, 5])
+        np.testing.assert_array_equal(some[0], whole[0])
+        np.testing.assert_array_equal(some[1], whole[1][:, :, list(keep)])
+        np.testing.assert_array_equal(some[2], whole[2][:, :, [1, 5]])
+        np.testing.assert_array_equal(some[3], whole[3])
+    _, turned = rows(network, 0, n, keep_camera=range(k - 1, -1, -1), keep_image=[5, 4, 3, 2, 1, 0])
+    np.testing.assert_array_equal(turned[1], whole[1][:, :, ::-1])
+    np.testing.assert_array_equal(turned[2], whole[2][:, :, ::-1])
+
+
+def test_weights_of_all_rows_and_narrow_indices():
+    network = two_cameras("RADIAL")
+    n = len(network.observations[0])
+    _, expected = rows(network, 200, n)
+    _, found = rows(network, 200, n, weights=np.ones((n, 2)), kind=np.int32)
+    weights = np.random.default_rng(4).random((n, 2))
+    _, weighted = rows(network, 200, n, weights=weights)
+    for a, b, c in zip(expected, found, weighted, strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_allclose(c, a * weights[200:].reshape(-1, 2, *[1] * (a.ndim - 2)), rtol=1e-13, atol=1e-300)
+
+
+def test_the_first_row_that_cannot_be_inverted_is_named():
+    network = two_cameras("brown")
+    group = network.observations[0]
+    bad = 3 * kernels.BATCH + 5
+    points = np.array(network.points.coordinates)
+    points[group.points[bad]] = np.nan
+    network = replace(network, points=replace(network.points, coordinates=points))
+    first = int(np.flatnonzero(group.points == group.points[bad])[0])
+    assert rows(network, 0, len(group))[0] == first
+    assert rows(network, first + 1, bad + 1)[0] == np.flatnonzero(group.points[first + 1 :] == group.points[bad])[0] + first + 1
+    assert rows(network, 0, first)[0] == -1
+
+
+def test_rows_that_do_not_lie_together(monkeypatch):
+    """Some rows of a group, in any order, are what they are among all."""
+    network = block("RADIAL")
+    group, state = network.observations[0], State.of(network)
+    monkeypatch.setattr(kernels, "COMPILE_FROM", 0)
+    (piece,) = group.pieces(network)
+    whole = group._compiled(piece, network, state, partials=True)
+    for some in (slice(10, 20), np.arange(0, 30, 2), np.array([5, 4, 9]), np.array([7])):
+        part = group._compiled(replace(piece, rows=piece.rows[some]), network, state, partials=True)
+        for a, b in zip(part, whole, strict=True):
+            np.testing.assert_array_equal(a, b[some])

@@ -19,9 +19,10 @@ from baarda.adjustment import lapack
 from baarda.adjustment.dense import refuse_null_space
 from baarda.adjustment.kernels import Kernels, kernels
 from baarda.adjustment.linear_system import Linearization
-from baarda.adjustment.row_blocks import Blocks, blocks_of, scaled_rows, sizes
+from baarda.adjustment.pairs import pairs
+from baarda.adjustment.row_blocks import Blocks, blocks_of, scaled_rows, sizes, with_partials
 from baarda.adjustment.selected_inverse import NodeBlocks, selected_inverse
-from baarda.adjustment.structure import Front, Structure
+from baarda.adjustment.structure import Front, Run, Structure
 from baarda.adjustment.workers import for_each, run_tree
 from baarda.errors import Singular, UsageError
 
@@ -30,7 +31,6 @@ Ints = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
 SEARCHED = 4000  # columns up to which a null space is sought in the whole reduced matrix
-AT_ONCE = 16_000_000  # doubles in the right-hand sides that are solved together
 SMALLEST_PIVOT = 1e-15  # of a column scaled to length 1: what other unknowns leave of its square
 
 
@@ -85,7 +85,8 @@ class BlockSolver:
             front = structure.fronts[f]
             n, p = len(front.columns), front.pivots
             matrix = np.zeros((n, n))
-            loops.accumulate(front.clusters, matrix, arrays, triangles, bad, size)
+            for run in structure.runs_of_fronts[f]:
+                loops.accumulate(run.clusters, matrix, with_partials(arrays, lin, run.spans), triangles, bad, size)
             for at, jacobian in rest.get(f, ()):
                 _add_rows(matrix, at, jacobian)
             for child in front.children:
@@ -107,8 +108,8 @@ class BlockSolver:
                 updates[f] = update.copy()
             panels[f] = np.ascontiguousarray(matrix[:, :p])
 
-        orphans = structure.orphans
-        loops.accumulate(orphans, np.zeros((0, 0)), arrays, triangles, bad, size)
+        for run in structure.runs_of_fronts[-1]:
+            loops.accumulate(run.clusters, np.zeros((0, 0)), with_partials(arrays, lin, run.spans), triangles, bad, size)
         with suppress(Singular):  # the reason is found below
             run_tree([len(f.children) for f in structure.fronts], [_after(f) for f in structure.fronts], factor, lin.workers)
         if bad.any():
@@ -170,18 +171,17 @@ class BlockSolver:
             x[-1] = 0.0
             return scaled[s.order, None] - self._scaled_transposed(self.lin.times(x[:-1], {"point"}), self._reduced_kinds)[s.order]
 
-        def forward(task: tuple[int, Ints]) -> Floats:
-            f, clusters = task
-            out = np.zeros(len(s.fronts[f].columns) if f >= 0 else 0)
-            self.loops.forward(clusters, y, self.blocks_, self.triangles, out)
+        def forward(run: Run) -> Floats:
+            out = np.zeros(len(s.fronts[run.front].columns) if run.front >= 0 else 0)
+            self.loops.forward(run.clusters, y, with_partials(self.blocks_, self.lin, run.spans), self.triangles, out)
             return out
 
         reduced = np.zeros(len(s.order) + 1)  # the last is for parameters that are fixed
-        for (f, _), part in zip(s.tasks, for_each(s.tasks, forward, self.lin.workers), strict=True):
-            if f >= 0:
-                reduced[s.fronts[f].columns] += part
+        for run, part in zip(s.runs, for_each(s.runs, forward, self.lin.workers), strict=True):
+            if run.front >= 0:
+                reduced[s.fronts[run.front].columns] += part
         for c, e, columns in self._rest:
-            own = np.einsum("nmw,nm->nw", scaled_rows(c, e.rows, self.inverse), y[c.rows[e.rows]])
+            own = np.einsum("nmw,nm->nw", scaled_rows(c, e.rows, self.inverse), y[c.rows_of(e.rows)])
             np.add.at(reduced, columns, own)
         return reduced[:-1, None]
 
@@ -200,13 +200,13 @@ class BlockSolver:
         solution = np.append(reduced[:, 0], 0.0)
         points, change = np.zeros((len(s.points), 3)), np.zeros(len(y))
 
-        def backward(task: tuple[int, Ints]) -> None:
-            self.loops.backward(task[1], solution, y, self.blocks_, self.triangles, points, change)
+        def backward(run: Run) -> None:
+            self.loops.backward(run.clusters, solution, y, with_partials(self.blocks_, self.lin, run.spans), self.triangles, points, change)
 
-        for _ in for_each(s.tasks, backward, self.lin.workers):
+        for _ in for_each(s.runs, backward, self.lin.workers):
             pass
         for c, e, columns in self._rest:
-            change[c.rows[e.rows]] = np.einsum("nmw,nw->nm", scaled_rows(c, e.rows, self.inverse), solution[columns])
+            change[c.rows_of(e.rows)] = np.einsum("nmw,nw->nm", scaled_rows(c, e.rows, self.inverse), solution[columns])
         x[s.point_columns] = points
         return x[:-1], change
 
@@ -290,7 +290,11 @@ class BlockSolver:
 
     def solve_reduced(self, rhs: Floats) -> Floats:
         """Return S^-1 rhs for (U, k) right-hand sides of the scaled reduced system in the order of elimination."""
-        return self._up(self._down(np.ascontiguousarray(rhs)))
+        x = self._down(np.ascontiguousarray(rhs))
+        if self.border_inverse is not None:
+            last = x[len(x) - len(self.border_inverse) :]
+            last[:] = self.border_inverse @ last
+        return self._up(x)
 
     def _down(self, x: Floats) -> Floats:
         """Eliminate front by front, in place; what is left for a border stands in its rows."""
@@ -365,24 +369,7 @@ class BlockSolver:
 
     def pairs(self, a: Ints, b: Ints) -> Floats:
         """Return the (len(a), len(b)) block of N^-1 for any columns; zero where a column is -1 or held."""
-        order = self.structure.order
-        place = np.full(len(self.inverse), -1)
-        place[order] = np.arange(len(order))
-        place[-1] = -1
-        reduced = bool((place[a] >= 0).all() and (place[b] >= 0).all())
-        size = len(order) if reduced else len(self.inverse) - 1
-        out = np.zeros((len(a), len(b)))
-        step = max(1, AT_ONCE // max(size, 1))
-        for k in range(0, len(b), step):
-            some = b[k : k + step]
-            unit = np.zeros((size + 1, len(some)))
-            if reduced:  # the points need not be known
-                unit[place[some], np.arange(len(some))] = self.inverse[some]
-                out[:, k : k + step] = self.solve_reduced(unit[:-1])[place[a]] * self.inverse[a][:, None]
-            else:
-                unit[some, np.arange(len(some))] = 1.0  # that of -1 is the last row
-                out[:, k : k + step] = np.append(self.solve(unit[:-1]), np.zeros((1, len(some))), axis=0)[a]
-        return out
+        return pairs(self, a, b)
 
     @cached_property
     def _statistics(self) -> tuple[list[Floats], Floats, NodeBlocks]:
@@ -435,7 +422,8 @@ def _refuse_nodes(
     rest = _rest_by_front(lin, structure, inverse)
     for f, front in enumerate(structure.fronts):
         part = np.zeros((len(front.columns), len(front.columns)))
-        loops.accumulate(front.clusters, part, arrays, scratch, flags, size)
+        for run in structure.runs_of_fronts[f]:
+            loops.accumulate(run.clusters, part, with_partials(arrays, lin, run.spans), scratch, flags, size)
         for at, jacobian in rest.get(f, ()):
             _add_rows(part, at, jacobian)
         matrix[np.ix_(front.columns, front.columns)] += part

@@ -14,8 +14,6 @@ from baarda.adjustment.solver import Solver
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
-AT_ONCE = 16_000_000  # doubles in the right-hand sides that are solved together
-
 
 @dataclass(frozen=True)
 class Cofactors:
@@ -34,17 +32,11 @@ class Cofactors:
         b = a if b is None else b
         if len(b) > len(a):
             return self.of(b, a).T
-        if self.datum.transfer is None:
-            return self.solver.pairs(a, b)
-        out = np.zeros((len(a), len(b)))
-        step = max(1, AT_ONCE // max(self.count, 1))
-        for k in range(0, len(b), step):
-            some = b[k : k + step]
-            unit = np.zeros((self.count, len(some)))
-            free = some >= 0
-            unit[some[free], np.flatnonzero(free)] = 1.0
-            out[:, k : k + step] = np.where(a[:, None] >= 0, self.solve(unit)[a], 0.0)
-        return out
+        out = self.solver.pairs(a, b)
+        if self._inner is None:
+            return out
+        t, k, c = self._inner
+        return np.asarray(out - t[a] @ k[b].T - k[a] @ t[b].T + t[a] @ c @ t[b].T)
 
     @cached_property
     def _inner(self) -> tuple[Floats, Floats, Floats] | None:

@@ -64,7 +64,7 @@ class DenseSolver:
         out = []
         for c in self.lin.chunks:
             at = self.place[np.concatenate([p.columns for p in c.parts], axis=1)]
-            jacobian = np.concatenate([p.jacobian for p in c.parts], axis=2)
+            jacobian = np.concatenate(c.partials(), axis=2)
             out.append(np.asarray(jacobian @ inverse[at[:, :, None], at[:, None, :]] @ jacobian.transpose(0, 2, 1)))
         return out
 

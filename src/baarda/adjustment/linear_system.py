@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -19,7 +19,8 @@ from baarda.network import UnknownGroup, Unknowns
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
-PIECE = 16384  # row blocks handled by one task
+PIECE = 4096  # row blocks handled by one task
+SHARES = 4  # tasks that need memory of their own
 FEW = 100_000  # observations up to which many vectors at once are multiplied by the sparse matrix
 
 
@@ -28,7 +29,7 @@ class Part:
     """The columns of one unknown group in a chunk: nodes (N,), the positions (w,) kept of each node, whitened partials (N, m, w).
 
     Positions are kept where any node of this kind and width has an unknown; where a node has none, its column is -1. The partials are
-    a view of the values of the linearization, from `start`.
+    a view of the values of the linearization, from `start`; none and -1 where the chunk evaluates them.
     """
 
     group: UnknownGroup
@@ -62,7 +63,9 @@ class Part:
 class Chunk:
     """Whitened row blocks: first scalar row (N,), misclosures (N, m), parts, and the factors L (N, m, m) of the cofactors Q = L L'.
 
-    Of a combined model with fewer conditions than observations, `controlled` (N, m, m) projects onto what the conditions control.
+    Of a combined model with fewer conditions than observations, `controlled` (N, m, m) projects onto what the conditions control. The
+    partials of large groups, which would take more memory than all the rest, are not stored: `evaluate` writes those of some row blocks
+    (a slice or indices) into an array, part after part.
     """
 
     first: Ints
@@ -70,11 +73,30 @@ class Chunk:
     parts: tuple[Part, ...]
     factor: Floats
     controlled: Floats | None = None
+    evaluate: Callable[[Any, Floats], None] | None = None
 
     @property
     def rows(self) -> Ints:
         """The (N, m) scalar rows."""
-        return np.asarray(self.first[:, None] + np.arange(self.misclosure.shape[1]))
+        return self.rows_of(slice(None))
+
+    def rows_of(self, blocks: Any) -> Ints:
+        """Return the (n, m) scalar rows of some row blocks."""
+        return np.asarray(self.first[blocks][:, None] + np.arange(self.misclosure.shape[1]))
+
+    @property
+    def per_block(self) -> int:
+        """The number of partials of a row block."""
+        return int(self.misclosure.shape[1]) * sum(len(p.positions) for p in self.parts)
+
+    def partials(self, rows: Any = slice(None)) -> list[Floats]:
+        """Return the whitened partials (n, m, w) of each part at some row blocks, a slice or indices."""
+        if self.evaluate is None:
+            return [p.jacobian[rows] for p in self.parts]
+        n = len(range(*rows.indices(len(self.first)))) if isinstance(rows, slice) else len(rows)
+        values = np.empty(n * self.per_block)
+        self.evaluate(rows, values)
+        return split(values, n, self.misclosure.shape[1], self.parts)
 
     @property
     def correlated(self) -> bool:
@@ -84,7 +106,31 @@ class Chunk:
 
     def pieces(self) -> list[slice]:
         """Return slices of row blocks that one task handles."""
-        return [slice(a, a + PIECE) for a in range(0, len(self.first), PIECE)]
+        return _pieces(0, len(self.first))
+
+    def shares(self) -> list[slice]:
+        """Return a few slices of row blocks for tasks that need memory of their own."""
+        n = len(self.first)
+        count = SHARES if n > PIECE else 1
+        return [slice(n * k // count, n * (k + 1) // count) for k in range(count)]
+
+
+def _pieces(begin: int, end: int) -> list[slice]:
+    return [slice(a, min(a + PIECE, end)) for a in range(begin, end, PIECE)]
+
+
+def _weighted(evaluate: Callable[[Any, Floats], None], parts: Sequence[Part], w: Floats, rows: Any, values: Floats) -> None:
+    """Evaluate row blocks and multiply their rows by w (N, m)."""
+    evaluate(rows, values)
+    own = w[rows]
+    for jacobian in split(values, len(own), own.shape[1], parts):
+        jacobian *= own[:, :, None]
+
+
+def split(values: Floats, count: int, rows: int, parts: Sequence[Part]) -> list[Floats]:
+    """Return the views (count, rows, w) of the partials of each part, which lie one after the other."""
+    ends = count * rows * np.cumsum([0, *(len(p.positions) for p in parts)])
+    return [values[a:b].reshape(count, rows, -1 if count else len(p.positions)) for a, b, p in zip(ends[:-1], ends[1:], parts, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -98,7 +144,7 @@ class Linearization:
     count : int
         Number n of scalar observations.
     values : array
-        The partials of all chunks and parts, one after the other.
+        The stored partials of all chunks and parts, one after the other.
     workers : int or None
         Number of threads; None = one for each core. Nothing depends on it but the time.
     """
@@ -108,6 +154,11 @@ class Linearization:
     count: int
     values: Floats
     workers: int | None = None
+
+    @property
+    def stored(self) -> bool:
+        """Whether all partials are stored."""
+        return all(c.evaluate is None for c in self.chunks)
 
     @cached_property
     def uncontrolled(self) -> int:
@@ -128,6 +179,9 @@ class Linearization:
         chunks = []
         for c in self.chunks:
             w = roots[c.rows]
+            if c.evaluate is not None:
+                chunks.append(replace(c, misclosure=c.misclosure * w, evaluate=partial(_weighted, c.evaluate, c.parts, w)))
+                continue
             parts = []
             for p in c.parts:
                 view = values[p.start : p.start + p.jacobian.size].reshape(p.jacobian.shape)
@@ -152,8 +206,8 @@ class Linearization:
                 ends = np.flatnonzero(held)
                 rows = np.unique(np.concatenate([ends[:: len(ends) // most + 1], rows[:: len(rows) // most + 1]]))
             parts = []
-            for p in c.parts:
-                values.append(np.ascontiguousarray(p.jacobian[rows]))
+            for p, jacobian in zip(c.parts, c.partials(rows), strict=True):
+                values.append(np.ascontiguousarray(jacobian))
                 parts.append(replace(p, nodes=p.nodes[rows], jacobian=values[-1], start=at))
                 at += values[-1].size
             m = c.misclosure.shape[1]
@@ -168,7 +222,8 @@ class Linearization:
         """The whitened misclosures, (n,)."""
         out = np.empty(self.count)
         for c in self.chunks:
-            out[c.rows] = c.misclosure
+            for r, own in enumerate(c.misclosure.T):
+                out[c.first + r] = own
         return out
 
     @cached_property
@@ -176,13 +231,13 @@ class Linearization:
         """The whitened design matrix, (n, u), sparse by rows: for small systems and as an oracle; `times` and `transposed` need no copy."""
         rows, columns, values = [], [], []
         for c in self.chunks:
-            for part in c.parts:
-                shape = part.jacobian.shape
+            for part, jacobian in zip(c.parts, c.partials(), strict=True):
+                shape = jacobian.shape
                 column = np.broadcast_to(part.columns[:, None, :], shape)
                 used = column >= 0
                 rows.append(np.broadcast_to(c.rows[:, :, None], shape)[used])
                 columns.append(column[used])
-                values.append(part.jacobian[used])
+                values.append(jacobian[used])
         if not rows:
             return sparse.csr_array((self.count, self.unknowns.count))
         coordinates = (np.concatenate(rows), np.concatenate(columns))
@@ -200,9 +255,9 @@ class Linearization:
         multiply = loops.times if x.ndim == 1 else loops.times_many
 
         def product(c: Chunk, some: slice) -> None:
-            for part in c.parts:
+            for part, jacobian in zip(c.parts, c.partials(some), strict=True):
                 if kinds is None or part.kind in kinds:
-                    multiply(part.jacobian[some], part.nodes[some], part.table, padded, c.first[some], out)
+                    multiply(jacobian, part.nodes[some], part.table, padded, c.first[some], out)
 
         self._each(product)
         return out
@@ -214,7 +269,8 @@ class Linearization:
 
         def sums(c: Chunk, some: slice) -> None:
             m = c.misclosure.shape[1]
-            total = sum(np.einsum("nmw,nmw,nw->nm", p.jacobian[some], p.jacobian[some], padded[p.columns_of(some)]) for p in c.parts)
+            pairs = zip(c.parts, c.partials(some), strict=True)
+            total = sum(np.einsum("nmw,nmw,nw->nm", jacobian, jacobian, padded[p.columns_of(some)]) for p, jacobian in pairs)
             out[c.first[some][:, None] + np.arange(m)] = total
 
         self._each(sums)
@@ -233,22 +289,26 @@ class Linearization:
         return self._gathered(weights, None, squared=True)
 
     def _gathered(self, y: Floats, kinds: Container[str] | None, squared: bool) -> Floats:
-        """Add up what the row blocks contribute to their columns, part by part."""
+        """Add up what the row blocks contribute to their columns."""
         loops = vector_loops(self.count)
-        parts = [(c, p) for c in self.chunks for p in c.parts if kinds is None or p.kind in kinds]
         y = np.ascontiguousarray(y)
+        tasks = [(c, share) for c in self.chunks for share in c.shares()]
 
-        def contribute(i: int) -> Floats:
-            c, part = parts[i]
+        def contribute(task: tuple[Chunk, slice]) -> Floats:
+            c, share = task
             own = np.zeros((self.unknowns.count + 1, *y.shape[1:]))
-            if y.ndim == 1:
-                loops.gathered(part.jacobian, part.nodes, part.table, y, c.first, squared, own)
-            else:
-                loops.gathered_many(part.jacobian, part.nodes, part.table, y, c.first, own)
+            for some in [share] if c.evaluate is None else _pieces(share.start, share.stop):
+                for part, jacobian in zip(c.parts, c.partials(some), strict=True):
+                    if kinds is not None and part.kind not in kinds:
+                        continue
+                    if y.ndim == 1:
+                        loops.gathered(jacobian, part.nodes[some], part.table, y, c.first[some], squared, own)
+                    else:
+                        loops.gathered_many(jacobian, part.nodes[some], part.table, y, c.first[some], own)
             return own
 
         out = np.zeros((self.unknowns.count + 1, *y.shape[1:]))
-        for own in for_each(range(len(parts)), contribute, self.workers):
+        for own in for_each(tasks, contribute, self.workers):
             out += own
         return out[:-1]
 

@@ -9,15 +9,22 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
-from baarda.adjustment.linear_system import Chunk, Linearization, Part
+from baarda.adjustment.linear_system import PIECE, Chunk, Linearization, Part, split
 from baarda.adjustment.workers import for_each
 from baarda.errors import InputError, UsageError
 from baarda.network import Network, State, UnknownGroup, Unknowns
 from baarda.observations import Kind, Rows
+from baarda.observations.image_points import Piece
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+
+
+EVALUATED_FROM = 100_000  # rows of a group whose partials are evaluated wherever they are needed, not stored
+MANY_OPTICS = 16  # more than these are stored
+FEW_BESIDE = 10_000  # scalar rows of other groups with points: their partials are copied where those of a group are evaluated
 
 
 @dataclass(frozen=True)
@@ -29,25 +36,38 @@ class Arrangement:
     groups, sorted : tuples of observation groups
     orders : tuple of int arrays
         The rows of each sorted group in the source's group.
+    ranked : bool
+        Whether there was a rank to sort by.
     """
 
     groups: tuple[Kind, ...]
     sorted: tuple[Kind, ...]
     orders: tuple[Ints, ...]
+    ranked: bool = False
 
     @staticmethod
-    def of(groups: Sequence[Kind], point_rank: Ints | None = None) -> Arrangement:
-        """Sort the groups that allow it by the rank of their points; without ranks all stay as they are."""
+    def of(groups: Sequence[Kind], point_rank: Ints | None = None, network: Network | None = None) -> Arrangement:
+        """Sort the groups that allow it by the rank of their points; without ranks all stay as they are.
+
+        Given a network, image points of a few different optics are sorted by these first, so that the partials of each can be evaluated
+        stretch by stretch.
+        """
         chosen, orders = [], []
         group: Any
         for group in groups:
             order = np.arange(len(group))
             if point_rank is not None and hasattr(group, "pieces"):
-                order = np.argsort(point_rank[group.points], kind="stable")
+                order = _sorted(point_rank[group.points], len(point_rank))
+                stretches = [] if network is None else group.by_optics(network)
+                if 1 < len(stretches) <= MANY_OPTICS:
+                    kind = np.empty(len(group), dtype=np.intp)
+                    for i, (_, rows) in enumerate(stretches):
+                        kind[rows] = i
+                    order = order[np.argsort(kind[order], kind="stable")]
                 group = group.selected(order)
             chosen.append(group)
             orders.append(order)
-        return Arrangement(tuple(groups), tuple(chosen), tuple(orders))
+        return Arrangement(tuple(groups), tuple(chosen), tuple(orders), point_rank is not None)
 
     @cached_property
     def offsets(self) -> Ints:
@@ -83,11 +103,15 @@ def linearize(
     """
     arranged = groups if isinstance(groups, Arrangement) else Arrangement.of(groups)
     kept = kept_positions(unknowns)
-    fillings: list[_Filling] = []
+    fillings: list[_Filling | Chunk] = []
+    large = _large(arranged)
     group: Any
     for g, group in enumerate(arranged.sorted):
         first = arranged.offsets[g] + arranged.orders[g] * len(group.components)
-        if hasattr(group, "pieces"):
+        evaluated = _evaluated(group, first, network, state, unknowns, kept, workers) if g in large else None
+        if evaluated is not None:
+            fillings += evaluated
+        elif hasattr(group, "pieces"):
             by_width: dict[int, list[Any]] = {}
             for piece in group.pieces(network):
                 by_width.setdefault(piece.width, []).append(piece)
@@ -100,12 +124,74 @@ def linearize(
         else:
             for rows in group.linearize(network, state):
                 fillings.append(_Filling.of(rows, [], first[rows.index], unknowns, kept, group.name))
-    values = np.empty(sum(f.size for f in fillings))
+    values = np.empty(sum(f.size for f in fillings if isinstance(f, _Filling)))
     start = 0
+    chunks = []
     for f in fillings:
-        f.fill(values, start, workers)
-        start += f.size
-    return Linearization(unknowns, tuple(f.chunk() for f in fillings), int(arranged.offsets[-1]), values, workers)
+        if isinstance(f, _Filling):
+            f.fill(values, start, workers)
+            start += f.size
+        chunks.append(f.chunk() if isinstance(f, _Filling) else f)
+    return Linearization(unknowns, tuple(chunks), int(arranged.offsets[-1]), values, workers)
+
+
+def _sorted(keys: Ints, count: int) -> Ints:
+    """Return the stable order of keys below a number: counted, which is faster than sorted."""
+    n = len(keys)
+    ones = np.ones(n, dtype=np.int8)
+    return np.asarray(sparse.csr_array((ones, (keys, np.arange(n))), shape=(count, n)).indices, dtype=np.intp)
+
+
+def _large(arranged: Arrangement) -> set[int]:
+    """Return the sorted groups whose partials are not to be stored."""
+    if not arranged.ranked:
+        return set()
+    groups: list[Any] = list(arranged.sorted)
+    large = {g for g, group in enumerate(groups) if hasattr(group, "pieces") and len(group) >= EVALUATED_FROM}
+    others = [group for g, group in enumerate(groups) if g not in large and getattr(group, "kind", "point") == "point"]
+    beside = sum(len(group) * len(group.components) for group in others)
+    return large if beside <= FEW_BESIDE else set()
+
+
+def _evaluated(
+    group: Any, first: Ints, network: Network, state: State, unknowns: Unknowns, kept: Any, workers: int | None
+) -> list[Chunk] | None:
+    """Return a chunk for each optics whose partials are evaluated wherever they are needed; None where that cannot be done."""
+    chunks = []
+    stretches = group.by_optics(network)
+    for optics, rows in stretches:
+        begin, count = int(rows[0]), len(rows)
+        if len(stretches) > MANY_OPTICS or int(rows[-1]) - begin != count - 1:
+            return None
+        some = slice(begin, begin + count)
+        nodes = {"camera": network.images.cameras[group.images[some]], "image": group.images[some], "point": group.points[some]}
+        width = {"camera": len(optics.model.order), "image": 6, "point": 3}
+        nothing = np.zeros(0, dtype=np.intp)
+        positions = [kept.get((kind, width[kind]), nothing) for kind in nodes]
+        misclosure = np.empty((count, 2))
+        pieces = [Piece(optics, rows[a : a + PIECE]) for a in range(0, count, PIECE)]
+
+        def work(piece: Any, out: Floats = misclosure, begin: int = begin, positions: list[Ints] = positions) -> bool:
+            own = out[piece.rows[0] - begin : piece.rows[-1] + 1 - begin]
+            return bool(group.evaluate(network, state, piece, own, positions))
+
+        if not all(for_each(pieces, work, workers)):
+            return None
+        parts = tuple(Part(unknowns[k], nodes[k], at, np.zeros((0, 2, len(at))), -1) for k, at in zip(nodes, positions, strict=True))
+        evaluate = partial(_partials, group, network, state, optics, begin, count, parts)
+        factor = np.broadcast_to(_diagonal(np.asarray(group.sigmas[some])), (count, 2, 2))
+        chunks.append(Chunk(first[some], misclosure, parts, factor, None, evaluate))
+    return chunks
+
+
+def _partials(
+    group: Any, network: Network, state: State, optics: Any, begin: int, count: int, parts: tuple[Part, ...], rows: Any, values: Floats
+) -> None:
+    """Write the whitened partials of some of the `count` rows of a group from `begin`, a slice or indices, part after part."""
+    at = begin + (np.arange(*rows.indices(count)) if isinstance(rows, slice) else rows)
+    piece, misclosure = Piece(optics, at), np.empty((len(at), 2))
+    if not group.evaluate(network, state, piece, misclosure, [p.positions for p in parts], split(values, len(at), 2, parts)):
+        raise UsageError(f"{group.name}: the partials of {group.images_of(network, piece)} cannot be evaluated")
 
 
 def kept_positions(unknowns: Unknowns) -> dict[tuple[str, int], Ints]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from baarda.adjustment.linear_system import Chunk, Linearization
+from baarda.adjustment.linear_system import Chunk, Linearization, split
 from baarda.adjustment.structure import Structure
 
 Floats = NDArray[np.float64]
@@ -23,7 +23,7 @@ class Blocks(NamedTuple):
     Attributes
     ----------
     values : array
-        The partials of all chunks.
+        The stored partials that the loops need, and those evaluated for some points: see `with_partials`.
     table : (chunks, 5 + 3 parts) int array
         For each chunk the rows m of a block, the number of parts, where the partials of the point, the places of the blocks and their
         scalar rows begin, and for each part where its partials begin, its width, and whether it is a node.
@@ -94,6 +94,40 @@ def blocks_of(lin: Linearization, structure: Structure, inverse: Floats, damping
     )  # fmt: skip
 
 
+def with_partials(blocks: Blocks, lin: Linearization, spans: Ints) -> Blocks:
+    """Return the arrays with the partials of some row blocks, evaluated where they are not stored.
+
+    Parameters
+    ----------
+    blocks : Blocks
+    lin : Linearization
+    spans : (chunks, 2) int array
+        The first and the last row block, that one not included, of each chunk.
+    """
+    if lin.stored:
+        return blocks
+    table, at = blocks.table.copy(), 0
+    counts = spans[:, 1] - spans[:, 0]
+    values = np.empty(sum(int(n) * c.per_block for n, c in zip(counts, lin.chunks, strict=True)))
+    for k, (c, n) in enumerate(zip(lin.chunks, counts, strict=True)):
+        if not n:
+            continue
+        begin, m = int(spans[k, 0]), c.misclosure.shape[1]
+        some, own = slice(begin, begin + int(n)), values[at : at + int(n) * c.per_block]
+        if c.evaluate is not None:
+            c.evaluate(some, own)
+        else:
+            for view, p in zip(split(own, int(n), m, c.parts), c.parts, strict=True):
+                view[...] = p.jacobian[some]
+        for j, p in enumerate(c.parts):
+            start = at - begin * m * len(p.positions)
+            table[k, HEAD + 3 * j] = start
+            if not table[k, HEAD + 2 + 3 * j]:
+                table[k, 2] = start
+            at += int(n) * m * len(p.positions)
+    return blocks._replace(values=values, table=table)
+
+
 def sizes(structure: Structure, blocks: Blocks) -> Ints:
     """Return the sizes of the loops' buffers.
 
@@ -120,4 +154,4 @@ def sizes(structure: Structure, blocks: Blocks) -> Ints:
 
 def scaled_rows(c: Chunk, rows: Ints, inverse: Floats) -> Floats:
     """Return the partials (N, m, w) of some row blocks of a chunk with scaled columns."""
-    return np.concatenate([p.jacobian[rows] * inverse[p.columns_of(rows)][:, None, :] for p in c.parts], axis=2)
+    return np.concatenate([j * inverse[p.columns_of(rows)][:, None, :] for p, j in zip(c.parts, c.partials(rows), strict=True)], axis=2)

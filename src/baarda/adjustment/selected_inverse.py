@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from baarda.adjustment import lapack
 from baarda.adjustment.linear_system import Linearization
-from baarda.adjustment.row_blocks import scaled_rows
+from baarda.adjustment.row_blocks import scaled_rows, with_partials
 from baarda.adjustment.structure import Front, Structure
 from baarda.adjustment.workers import run_tree
 
@@ -66,7 +66,8 @@ def selected_inverse(solver: BlockSolver) -> tuple[list[Floats], Floats, NodeBlo
     def finish(f: int, z: Floats, p: int) -> None:
         """Use the inverse of a front, its first p columns its own."""
         front = structure.fronts[f]
-        solver.loops.statistics(front.clusters, z, blocks, hat, points, solver.size)
+        for run in structure.runs_of_fronts[f]:
+            solver.loops.statistics(run.clusters, z, with_partials(blocks, lin, run.spans), hat, points, solver.size)
         for chunk, rows, at in rest.get(f, ()):
             _rest_hat(lin, solver.inverse, blocks.hat, z, chunk, rows, at, hat)
         own[f] = z[:p, :p].copy()
@@ -81,7 +82,8 @@ def selected_inverse(solver: BlockSolver) -> tuple[list[Floats], Floats, NodeBlo
     fronts = structure.fronts
     before = [int(f.parent >= 0) for f in reversed(fronts)]  # from the root to the leaves
     run_tree(before, _children_backwards(fronts), lambda i: invert(len(fronts) - 1 - i), lin.workers)
-    solver.loops.statistics(structure.orphans, np.zeros((0, 0)), blocks, hat, points, solver.size)
+    for run in structure.runs_of_fronts[-1]:
+        solver.loops.statistics(run.clusters, np.zeros((0, 0)), with_partials(blocks, lin, run.spans), hat, points, solver.size)
     for f, entries in rest.items():
         if f < 0:
             for chunk, rows, at in entries:

@@ -159,7 +159,7 @@ def _adjust(network: Network, settings: Settings) -> Adjustment:
         memory.of_rows(unknowns, groups) + (memory.of_dense(unknowns) if kind == "dense" else 0.0), "the observations", settings.tell
     )
     rank = rank_for(groups, start.points)
-    arranged = Arrangement.of(groups, rank if kind == "block" else None)
+    arranged = Arrangement.of(groups, rank if kind == "block" else None, prepared)
     lin = linearize(prepared, start, unknowns, arranged, settings.jobs)
     check_finite(lin, groups, prepared)
     defect = find_defect(lin, start)
@@ -232,7 +232,7 @@ def prepare(network: Network, settings: Settings) -> tuple[Network, NDArray[np.b
         changed = group
         if isinstance(group, ImagePoints):
             if settings.image_sigma is not None:
-                changed = replace(changed, sigmas=np.full(changed.sigmas.shape, settings.image_sigma))
+                changed = replace(changed, sigmas=np.broadcast_to(float(settings.image_sigma), changed.sigmas.shape))
             if settings.residual_plane is not None:
                 changed = replace(changed, residual_plane=settings.residual_plane)
         observations.append(changed)

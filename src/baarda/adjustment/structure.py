@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ Ints = NDArray[np.intp]
 Small = NDArray[np.int32]
 Bools = NDArray[np.bool_]
 
-TASK = 20_000  # row blocks of one task
+RUN = 8192  # row blocks of one task
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,14 @@ class Front:
     into_parent: Ints
     children: tuple[int, ...]
     clusters: Ints
+
+
+class Run(NamedTuple):
+    """Neighbouring clusters of a front (-1 = none), and the span of their row blocks in each chunk, (chunks, 2)."""
+
+    front: int
+    clusters: Ints
+    spans: Ints
 
 
 @dataclass(frozen=True)
@@ -119,14 +127,35 @@ class Structure:
     border: int = 0
 
     @cached_property
-    def tasks(self) -> list[tuple[int, Ints]]:
-        """Front and clusters of tasks of some size, which share nothing; clusters without a node belong to the front -1."""
-        blocks = np.diff(self.first_block[self.first_point])
+    def runs(self) -> tuple[Run, ...]:
+        """Neighbouring clusters of each front, some thousand row blocks each; clusters without a node belong to the front -1."""
+        ends = self.first_block[self.first_point]
         out = []
         for f, clusters in [*((f, front.clusters) for f, front in enumerate(self.fronts)), (-1, self.orphans)]:
-            if len(clusters):
-                cuts = np.flatnonzero(np.diff(np.cumsum(blocks[clusters]) // TASK)) + 1
-                out += [(f, part) for part in np.split(clusters, cuts) if len(part)]
+            if not len(clusters):
+                continue
+            share = np.cumsum(np.diff(ends)[clusters]) // RUN
+            cuts = np.flatnonzero((np.diff(clusters) != 1) | (np.diff(share) != 0)) + 1
+            for some in np.split(clusters, cuts):
+                span = slice(ends[some[0]], ends[some[-1] + 1])
+                out.append(Run(f, some, self._spans(self.block_chunk[span], self.block_row[span])))
+        return tuple(out)
+
+    @cached_property
+    def runs_of_fronts(self) -> list[list[Run]]:
+        """The runs of each front, and last those of the clusters without a node."""
+        out: list[list[Run]] = [[] for _ in range(len(self.fronts) + 1)]
+        for run in self.runs:
+            out[run.front].append(run)
+        return out
+
+    def _spans(self, chunk: Small, row: Small) -> Ints:
+        """Return the first and the last row block, that one not included, of each chunk."""
+        out = np.zeros((len(self.point_part), 2), dtype=np.intp)
+        for k in range(len(out)):
+            rows = row if len(out) == 1 else row[chunk == k]
+            if len(rows):
+                out[k] = rows.min(), rows.max() + 1
         return out
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -80,8 +81,8 @@ class ImagePoints:
             np.asarray(images, dtype=np.intp),
             np.asarray(points, dtype=np.intp),
             np.asarray(xy, dtype=float).reshape(n, 2),
-            np.broadcast_to(np.asarray(sigmas, dtype=float), (n, 2)).copy(),
-            np.zeros(n) if correlations is None else np.asarray(correlations, dtype=float),
+            np.broadcast_to(np.asarray(sigmas, dtype=float), (n, 2)),
+            np.broadcast_to(0.0, n) if correlations is None else np.asarray(correlations, dtype=float),
             **rest,
         )
 
@@ -98,8 +99,8 @@ class ImagePoints:
             images=self.images[keep],
             points=self.points[keep],
             xy=self.xy[keep],
-            sigmas=self.sigmas[keep],
-            correlations=self.correlations[keep],
+            sigmas=_selected(self.sigmas, keep),
+            correlations=_selected(self.correlations, keep),
         )
 
     def points_of(self) -> tuple[Ints, ...]:
@@ -118,18 +119,21 @@ class ImagePoints:
         """Return image and point codes."""
         return {"image": self.images, "point": self.points}
 
-    def pieces(self, network: Network) -> list[Piece]:
-        """Split the rows by optics (model and constants), then into pieces of fixed size that can be handled side by side."""
+    def by_optics(self, network: Network) -> list[tuple[Optics, Ints]]:
+        """Return the rows of each optics (model and constants)."""
         optics: dict[tuple[Any, ...], tuple[Optics, list[int]]] = {}
         for i, c in enumerate(network.cameras):
             key = (c.model.name, *np.ravel(c.pixel_size), *np.ravel(c.origin), c.y_down, c.half_width)
             optics.setdefault(key, (Optics.of(c), []))[1].append(i)
+        if len(optics) == 1:
+            return [(o, np.arange(len(self))) for o, _ in optics.values()]
         camera = network.images.cameras[self.images]
-        out = []
-        for o, members in optics.values():
-            rows = np.flatnonzero(np.isin(camera, members)) if len(optics) > 1 else np.arange(len(self))
-            out += [Piece(o, rows[a : a + CHUNK]) for a in range(0, len(rows), CHUNK)]
-        return out
+        found = [(o, np.flatnonzero(np.isin(camera, members))) for o, members in optics.values()]
+        return [(o, rows) for o, rows in found if len(rows)]
+
+    def pieces(self, network: Network) -> list[Piece]:
+        """Split the rows by optics, then into pieces of fixed size that can be handled side by side."""
+        return [Piece(o, rows[a : a + CHUNK]) for o, rows in self.by_optics(network) for a in range(0, len(rows), CHUNK)]
 
     def _computed(self, optics: Optics, rows: Ints, network: Network, state: State) -> tuple[Any, ...]:
         image = self.images[rows]
@@ -211,39 +215,63 @@ class ImagePoints:
         (n, 2) array or None
             The sigmas; None where this cannot be done and nothing was written.
         """
-        if np.any(self.correlations[piece.rows]) or len(parts[2][0]) != 3:
+        (_, cameras, _), (_, images, _), (_, points, _) = parts
+        if not self.evaluate(network, state, piece, misclosure, [p[0] for p in parts], [p[2] for p in parts]):
             return None
-        sigma, image = self.sigmas[piece.rows], self.images[piece.rows]
-        (keep_camera, cameras, d_camera), (keep_image, images, d_image), (_, points, d_point) = parts
-        done = self._loop(piece, network, state, True, 1.0 / sigma, keep_camera, keep_image, misclosure, d_camera, d_image, d_point)
-        if not done:
-            return None
-        cameras[:], images[:], points[:] = network.images.cameras[image], image, self.points[piece.rows]
-        return sigma
+        images[:], points[:] = self.images[piece.rows], self.points[piece.rows]
+        cameras[:] = network.images.cameras[images]
+        return self.sigmas[piece.rows]
+
+    def evaluate(
+        self, network: Network, state: State, piece: Piece, misclosure: Floats, positions: Sequence[Ints], partials: Sequence[Floats] = ()
+    ) -> bool:
+        """Write the whitened misclosures of a piece, and its partials where there are arrays for them.
+
+        Parameters
+        ----------
+        network, state, piece
+            As for `linearize_piece`.
+        misclosure : (n, 2) array
+        positions : sequence of int arrays
+            The parameters to keep of camera, image and point.
+        partials : sequence of (n, 2, w) arrays
+
+        Returns
+        -------
+        bool
+            False where compiled loops cannot do this: see `_loop`; or for correlated coordinates and points that are fixed in part.
+        """
+        if np.any(self.correlations[piece.rows]) or len(positions[2]) != 3:
+            return False
+        weights = 1.0 / (self.sigmas[:1] if self.sigmas.strides[0] == 0 else self.sigmas[piece.rows])
+        out = partials if len(partials) else [np.empty((0, 2, len(p))) for p in positions]
+        return self._loop(piece, network, state, len(partials) > 0, weights, positions[0], positions[1], misclosure, *out)
 
     def _compiled(self, piece: Piece, network: Network, state: State, partials: bool) -> tuple[Floats, Floats, Floats, Floats] | None:
         """Evaluate a piece by compiled loops; None for small groups, other cameras, and where a distortion cannot be inverted."""
         n, k = len(piece.rows), piece.width
         count = n if partials else 0
         out = np.empty((n, 2)), np.empty((count, 2, k)), np.empty((count, 2, 6)), np.empty((count, 2, 3))
-        done = self._loop(piece, network, state, partials, np.ones((n, 2)), np.arange(k), np.arange(6), *out)
+        done = self._loop(piece, network, state, partials, np.ones((1, 2)), np.arange(k), np.arange(6), *out)
         return out if done else None
 
     def _loop(
         self, piece: Piece, network: Network, state: State, partials: bool, weights: Floats, cameras: Ints, images: Ints, *out: Floats
     ) -> bool:
-        """Run the compiled loop over a piece, where there is one for its camera."""
+        """Run the compiled loop over a piece, where there is one for its camera; `weights` are those of its rows, or one row for all."""
         if len(self) < kernels.COMPILE_FROM:
             return False
         program, loop = kernels.Program.of(piece.optics), kernels.compiled()
         if program is None or loop is None:
             return False
-        optics, image = piece.optics, self.images[piece.rows]
+        optics, rows = piece.optics, piece.rows
+        together = len(rows) > 0 and rows[-1] - rows[0] == len(rows) - 1 and bool(np.all(np.diff(rows) == 1))
+        group = self.selected(slice(rows[0], rows[-1] + 1) if together else rows)  # a slice takes views
         failed = loop(
             program.steps, program.places, program.measured, self.residual_plane == "corrected", _to_pixels(optics),
             np.ascontiguousarray(optics.pixel_size, dtype=float), np.ascontiguousarray(optics.origin, dtype=float),
-            state.camera_table(piece.width), state.rotation, state.position, state.points, network.images.cameras[image], image,
-            self.points[piece.rows], self.xy[piece.rows], partials, weights, cameras, images, *out,
+            state.camera_table(piece.width), state.rotation, state.position, state.points, network.images.cameras, group.images,
+            group.points, group.xy, weights, 0, len(rows), partials, cameras, images, *out,
         )  # fmt: skip
         return bool(failed < 0)
 
@@ -268,6 +296,15 @@ def _to_pixels(optics: Optics) -> Floats:
     """Return the factors from the meeting plane to source pixels and axes."""
     turned = optics.y_down and any(s.name == "flip" for s in optics.model.measured)
     return np.array([1.0, -1.0 if turned else 1.0]) / optics.pixel_size
+
+
+def _selected(values: Floats, keep: Any) -> Floats:
+    """Return some rows; of one value that stands for all rows no copies are made."""
+    if values.strides[0] or isinstance(keep, slice):
+        return np.asarray(values[keep])
+    index = np.asarray(keep)
+    count = int(index.sum()) if index.dtype == bool else len(index)
+    return np.broadcast_to(values[:1], (count, *values.shape[1:])) if len(values) else values
 
 
 def _equal(state: State) -> bool:

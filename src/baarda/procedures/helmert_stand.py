@@ -116,7 +116,7 @@ class Part:
         self.unknowns: Unknowns = unknowns_of(self.network, ~self.aside, with_images)
         self.start = State.of(self.network)
         self.rank = rank_for(self.groups, self.start.points)
-        self.arranged = Arrangement.of(self.groups, self.rank)
+        self.arranged = Arrangement.of(self.groups, self.rank, self.network)
         self._structure: Structure | None = None
         columns, codes, owned = [], [], []
         for (kind, label), code in zip(source.border, source.codes, strict=True):

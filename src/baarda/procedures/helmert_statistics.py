@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from baarda.adjustment.block import BlockSolver
-from baarda.adjustment.covariance import AT_ONCE, Cofactors
+from baarda.adjustment.covariance import Cofactors
 from baarda.adjustment.datum import Datum, Defect
 from baarda.adjustment.result import Adjustment
 from baarda.adjustment.solver import Solver
@@ -106,16 +106,7 @@ class PartSolver:
 
     def pairs(self, a: Ints, b: Ints) -> Floats:
         """Return the (len(a), len(b)) block of N^-1 for columns a and b; zero where a column is -1."""
-        out = np.zeros((len(a), len(b)))
-        count = self.solver.lin.unknowns.count
-        step = max(1, AT_ONCE // max(count, 1))
-        for k in range(0, len(b), step):
-            some = b[k : k + step]
-            unit = np.zeros((count, len(some)))
-            free = some >= 0
-            unit[some[free], np.flatnonzero(free)] = 1.0
-            out[:, k : k + step] = np.where(a[:, None] >= 0, self.solve(unit)[a], 0.0)
-        return out
+        return self.given.pairs(a, b)
 
 
 class PartCofactors(Cofactors):
@@ -126,41 +117,20 @@ class PartCofactors(Cofactors):
 
     def __init__(self, part: PartSolver, count: int, rows: tuple[Floats, Floats, Floats] | None) -> None:
         super().__init__(part, cast(Datum, None), count)
-        object.__setattr__(self, "_rows", rows)
-
-    @property
-    def _moved(self) -> tuple[Floats, Floats, Floats] | None:
-        return cast("tuple[Floats, Floats, Floats] | None", self.__dict__["_rows"])
+        padded = None
+        if rows is not None:
+            t, k, c = rows
+            last = np.zeros((1, c.shape[1]))  # of fixed parameters
+            padded = np.concatenate([t, last]), np.concatenate([k, last]), c
+        self.__dict__["_inner"] = padded
 
     def solve(self, rhs: Floats) -> Floats:
         """Return Q rhs of the part's unknowns, for (u,) or (u, k) right-hand sides on them."""
         out = self.solver.solve(rhs)
-        if self._moved is None:
+        if self._inner is None:
             return out
-        t, k, c = self._moved
+        t, k, c = self._inner[0][:-1], self._inner[1][:-1], self._inner[2]
         return np.asarray(out - t @ (k.T @ rhs) - k @ (t.T @ rhs) + t @ (c @ (t.T @ rhs)))
-
-    def of(self, a: Ints, b: Ints | None = None) -> Floats:
-        """Return the (len(a), len(b)) block of Q for columns a and b; zero where a column is -1 (fixed)."""
-        b = a if b is None else b
-        if len(b) > len(a):
-            return self.of(b, a).T
-        out = cast(PartSolver, self.solver).pairs(a, b)
-        if self._moved is None:
-            return out
-        row = np.zeros((1, self._moved[2].shape[1]))
-        t, k = (np.concatenate([x, row]) for x in self._moved[:2])
-        return np.asarray(out - t[a] @ k[b].T - k[a] @ t[b].T + t[a] @ self._moved[2] @ t[b].T)
-
-    def blocks(self, columns: Ints) -> Floats:
-        """Return the (N, w, w) diagonal blocks of Q for (N, w) columns, as a solver's `blocks`."""
-        out = self.solver.blocks(columns)
-        if self._moved is None:
-            return out
-        row = np.zeros((1, self._moved[2].shape[1]))
-        t, k = (np.concatenate([a, row])[columns] for a in self._moved[:2])
-        mixed = t @ k.transpose(0, 2, 1)
-        return np.asarray(out - mixed - mixed.transpose(0, 2, 1) + t @ self._moved[2] @ t.transpose(0, 2, 1))
 
 
 @dataclass(frozen=True)
