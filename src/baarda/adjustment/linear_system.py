@@ -96,7 +96,7 @@ class Chunk:
         n = len(range(*rows.indices(len(self.first)))) if isinstance(rows, slice) else len(rows)
         values = np.empty(n * self.per_block)
         self.evaluate(rows, values)
-        return split(values, n, self.misclosure.shape[1], self.parts)
+        return split(values, n, self.misclosure.shape[1], [p.positions for p in self.parts])
 
     @property
     def correlated(self) -> bool:
@@ -119,18 +119,22 @@ def _pieces(begin: int, end: int) -> list[slice]:
     return [slice(a, min(a + PIECE, end)) for a in range(begin, end, PIECE)]
 
 
-def _weighted(evaluate: Callable[[Any, Floats], None], parts: Sequence[Part], w: Floats, rows: Any, values: Floats) -> None:
+def _weighted(evaluate: Callable[[Any, Floats], None], positions: Sequence[Ints], w: Floats, rows: Any, values: Floats) -> None:
     """Evaluate row blocks and multiply their rows by w (N, m)."""
     evaluate(rows, values)
     own = w[rows]
-    for jacobian in split(values, len(own), own.shape[1], parts):
+    for jacobian in split(values, len(own), own.shape[1], positions):
         jacobian *= own[:, :, None]
 
 
-def split(values: Floats, count: int, rows: int, parts: Sequence[Part]) -> list[Floats]:
+def split(values: Floats, count: int, rows: int, positions: Sequence[Ints]) -> list[Floats]:
     """Return the views (count, rows, w) of the partials of each part, which lie one after the other."""
-    ends = count * rows * np.cumsum([0, *(len(p.positions) for p in parts)])
-    return [values[a:b].reshape(count, rows, -1 if count else len(p.positions)) for a, b, p in zip(ends[:-1], ends[1:], parts, strict=True)]
+    out, at = [], 0
+    for p in positions:
+        end = at + count * rows * len(p)
+        out.append(values[at:end].reshape(count, rows, len(p)))
+        at = end
+    return out
 
 
 @dataclass(frozen=True)
@@ -180,7 +184,9 @@ class Linearization:
         for c in self.chunks:
             w = roots[c.rows]
             if c.evaluate is not None:
-                chunks.append(replace(c, misclosure=c.misclosure * w, evaluate=partial(_weighted, c.evaluate, c.parts, w)))
+                chunks.append(
+                    replace(c, misclosure=c.misclosure * w, evaluate=partial(_weighted, c.evaluate, [p.positions for p in c.parts], w))
+                )
                 continue
             parts = []
             for p in c.parts:

@@ -16,7 +16,7 @@ from baarda.adjustment.workers import for_each
 from baarda.errors import InputError, UsageError
 from baarda.network import Network, State, UnknownGroup, Unknowns
 from baarda.observations import Kind, Rows
-from baarda.observations.image_points import Piece
+from baarda.observations.image_points import Evaluation
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -74,6 +74,11 @@ class Arrangement:
         """First scalar row of each group, and n."""
         return offsets_of(self.groups)
 
+    @cached_property
+    def first(self) -> tuple[Ints, ...]:
+        """First scalar row of each row of the sorted groups."""
+        return tuple(self.offsets[g] + order * len(self.groups[g].components) for g, order in enumerate(self.orders))
+
 
 def offsets_of(groups: Sequence[Kind]) -> Ints:
     """Return the first scalar row of each group, and the total at the end."""
@@ -107,7 +112,7 @@ def linearize(
     large = _large(arranged)
     group: Any
     for g, group in enumerate(arranged.sorted):
-        first = arranged.offsets[g] + arranged.orders[g] * len(group.components)
+        first = arranged.first[g]
         evaluated = _evaluated(group, first, network, state, unknowns, kept, workers) if g in large else None
         if evaluated is not None:
             fillings += evaluated
@@ -160,38 +165,49 @@ def _evaluated(
     chunks = []
     stretches = group.by_optics(network)
     for optics, rows in stretches:
-        begin, count = int(rows[0]), len(rows)
-        if len(stretches) > MANY_OPTICS or int(rows[-1]) - begin != count - 1:
-            return None
-        some = slice(begin, begin + count)
-        nodes = {"camera": network.images.cameras[group.images[some]], "image": group.images[some], "point": group.points[some]}
+        some, evaluation = slice(int(rows[0]), int(rows[-1]) + 1), group.evaluation(optics, network, state)
+        count = some.stop - some.start
         width = {"camera": len(optics.model.order), "image": 6, "point": 3}
-        nothing = np.zeros(0, dtype=np.intp)
-        positions = [kept.get((kind, width[kind]), nothing) for kind in nodes]
-        misclosure = np.empty((count, 2))
-        pieces = [Piece(optics, rows[a : a + PIECE]) for a in range(0, count, PIECE)]
-
-        def work(piece: Any, out: Floats = misclosure, begin: int = begin, positions: list[Ints] = positions) -> bool:
-            own = out[piece.rows[0] - begin : piece.rows[-1] + 1 - begin]
-            return bool(group.evaluate(network, state, piece, own, positions))
-
-        if not all(for_each(pieces, work, workers)):
+        positions = [kept.get(key, np.zeros(0, dtype=np.intp)) for key in width.items()]
+        whole = len(positions[2]) == 3 and not np.any(group.correlations[some])
+        if evaluation is None or len(stretches) > MANY_OPTICS or count != len(rows) or not whole:
             return None
-        parts = tuple(Part(unknowns[k], nodes[k], at, np.zeros((0, 2, len(at))), -1) for k, at in zip(nodes, positions, strict=True))
-        evaluate = partial(_partials, group, network, state, optics, begin, count, parts)
+        misclosure = np.empty((count, 2))
+        rays = Rays(evaluation, some.start, count, tuple(positions))
+        pieces = [slice(a, min(a + PIECE, count)) for a in range(0, count, PIECE)]
+        if not all(for_each(pieces, partial(rays.misclosures, misclosure), workers)):
+            return None
+        nodes = (network.images.cameras[group.images[some]], group.images[some], group.points[some])
+        parts = tuple(
+            Part(unknowns[kind], own, at, np.zeros((0, 2, len(at))), -1) for kind, own, at in zip(width, nodes, positions, strict=True)
+        )
         factor = np.broadcast_to(_diagonal(np.asarray(group.sigmas[some])), (count, 2, 2))
-        chunks.append(Chunk(first[some], misclosure, parts, factor, None, evaluate))
+        chunks.append(Chunk(first[some], misclosure, parts, factor, None, rays))
     return chunks
 
 
-def _partials(
-    group: Any, network: Network, state: State, optics: Any, begin: int, count: int, parts: tuple[Part, ...], rows: Any, values: Floats
-) -> None:
-    """Write the whitened partials of some of the `count` rows of a group from `begin`, a slice or indices, part after part."""
-    at = begin + (np.arange(*rows.indices(count)) if isinstance(rows, slice) else rows)
-    piece, misclosure = Piece(optics, at), np.empty((len(at), 2))
-    if not group.evaluate(network, state, piece, misclosure, [p.positions for p in parts], split(values, len(at), 2, parts)):
-        raise UsageError(f"{group.name}: the partials of {group.images_of(network, piece)} cannot be evaluated")
+@dataclass(frozen=True)
+class Rays:
+    """Evaluates the whitened misclosures and partials of some of the `count` rows of image points from `begin`."""
+
+    evaluation: Evaluation
+    begin: int
+    count: int
+    positions: tuple[Ints, ...]
+
+    def misclosures(self, out: Floats, rows: slice) -> bool:
+        """Fill rows of (count, 2) misclosures; return whether all distortions could be inverted."""
+        return self.evaluation(slice(self.begin + rows.start, self.begin + rows.stop), self.positions, out[rows])
+
+    def __call__(self, rows: Any, values: Floats) -> None:
+        """Write the partials of rows, a slice or indices, part after part."""
+        if isinstance(rows, slice):
+            start, stop, _ = rows.indices(self.count)
+            n, at = stop - start, slice(self.begin + start, self.begin + stop)
+        else:
+            n, at = len(rows), self.begin + rows
+        if not self.evaluation(at, self.positions, np.empty((n, 2)), split(values, n, 2, self.positions)):
+            raise UsageError(f"{self.evaluation.group.name}: a distortion cannot be inverted")
 
 
 def kept_positions(unknowns: Unknowns) -> dict[tuple[str, int], Ints]:
@@ -305,14 +321,14 @@ def whitened_misclosures(network: Network, state: State, groups: Sequence[Kind] 
     """Return the whitened misclosures (n,) without partials; not finite where an observation cannot be computed."""
     arranged = groups if isinstance(groups, Arrangement) else Arrangement.of(groups)
     out = np.empty(int(arranged.offsets[-1]))
-    for g, group in enumerate(arranged.sorted):
+    for group, first in zip(arranged.sorted, arranged.first, strict=True):
         m = len(group.components)
-        first = arranged.offsets[g] + arranged.orders[g] * m
         if hasattr(group, "pieces"):
 
             def work(piece: Any, group: Any = group, first: Ints = first, m: int = m) -> None:
-                misclosure = group.misclosures_of_piece(network, state, piece)
-                out[first[piece.rows][:, None] + np.arange(m)] = _white(misclosure, group, piece.rows)
+                white = _white(group.misclosures_of_piece(network, state, piece), group, piece.rows)
+                for r in range(m):
+                    out[first[piece.rows] + r] = white[:, r]
 
             for _ in for_each(group.pieces(network), work, workers):
                 pass

@@ -117,7 +117,7 @@ def with_partials(blocks: Blocks, lin: Linearization, spans: Ints) -> Blocks:
         if c.evaluate is not None:
             c.evaluate(some, own)
         else:
-            for view, p in zip(split(own, int(n), m, c.parts), c.parts, strict=True):
+            for view, p in zip(split(own, int(n), m, [p.positions for p in c.parts]), c.parts, strict=True):
                 view[...] = p.jacobian[some]
         for j, p in enumerate(c.parts):
             start = at - begin * m * len(p.positions)

@@ -33,6 +33,46 @@ class Piece:
 
 
 @dataclass(frozen=True)
+class Evaluation:
+    """Image points of one optics at one state, ready for the compiled loop: the group, the loop, and its arguments that do not change."""
+
+    group: ImagePoints
+    loop: Any
+    fixed: tuple[Any, ...]
+
+    def __call__(
+        self, rows: Any, positions: Sequence[Ints], misclosure: Floats, partials: Sequence[Floats] = (), weights: Floats | None = None
+    ) -> bool:
+        """Write misclosures and partials of some rows, each multiplied by its weight.
+
+        Parameters
+        ----------
+        rows : slice or int array
+        positions : sequence of int arrays
+            The parameters to keep of camera, image and point; all three of a point.
+        misclosure : (n, 2) array
+        partials : sequence of (n, 2, w) arrays
+            Of camera, image and point; none for misclosures alone.
+        weights : (n, 2) or (1, 2) array, optional
+            One over the sigmas, if not given.
+
+        Returns
+        -------
+        bool
+            False where a distortion could not be inverted.
+        """
+        g, some = self.group, _together(rows)
+        if weights is None:
+            weights = 1.0 / (g.sigmas[:1] if g.sigmas.strides[0] == 0 else g.sigmas[some])
+        own = [_read_only(x[some]) for x in (g.images, g.points, g.xy)]
+        out = partials if len(partials) else [np.empty((0, 2, len(p))) for p in positions]
+        failed = self.loop(
+            *self.fixed, *own, weights, 0, len(own[0]), len(partials) > 0, positions[0], positions[1], misclosure, *out
+        )  # fmt: skip
+        return bool(failed < 0)
+
+
+@dataclass(frozen=True)
 class ImagePoints:
     """Measured image coordinates.
 
@@ -216,64 +256,40 @@ class ImagePoints:
             The sigmas; None where this cannot be done and nothing was written.
         """
         (_, cameras, _), (_, images, _), (_, points, _) = parts
-        if not self.evaluate(network, state, piece, misclosure, [p[0] for p in parts], [p[2] for p in parts]):
+        evaluation = self.evaluation(piece.optics, network, state)
+        if np.any(self.correlations[piece.rows]) or len(parts[2][0]) != 3 or evaluation is None:
+            return None
+        if not evaluation(piece.rows, [p[0] for p in parts], misclosure, [p[2] for p in parts]):
             return None
         images[:], points[:] = self.images[piece.rows], self.points[piece.rows]
         cameras[:] = network.images.cameras[images]
         return self.sigmas[piece.rows]
 
-    def evaluate(
-        self, network: Network, state: State, piece: Piece, misclosure: Floats, positions: Sequence[Ints], partials: Sequence[Floats] = ()
-    ) -> bool:
-        """Write the whitened misclosures of a piece, and its partials where there are arrays for them.
-
-        Parameters
-        ----------
-        network, state, piece
-            As for `linearize_piece`.
-        misclosure : (n, 2) array
-        positions : sequence of int arrays
-            The parameters to keep of camera, image and point.
-        partials : sequence of (n, 2, w) arrays
-
-        Returns
-        -------
-        bool
-            False where compiled loops cannot do this: see `_loop`; or for correlated coordinates and points that are fixed in part.
-        """
-        if np.any(self.correlations[piece.rows]) or len(positions[2]) != 3:
-            return False
-        weights = 1.0 / (self.sigmas[:1] if self.sigmas.strides[0] == 0 else self.sigmas[piece.rows])
-        out = partials if len(partials) else [np.empty((0, 2, len(p))) for p in positions]
-        return self._loop(piece, network, state, len(partials) > 0, weights, positions[0], positions[1], misclosure, *out)
+    def evaluation(self, optics: Optics, network: Network, state: State) -> Evaluation | None:
+        """Return what evaluates rows of these optics at a state by the compiled loop; None for small groups and cameras without one."""
+        if len(self) < kernels.COMPILE_FROM:
+            return None
+        program, loop = kernels.Program.of(optics), kernels.compiled()
+        if program is None or loop is None:
+            return None
+        return Evaluation(
+            self, loop,
+            (
+                program.steps, program.places, program.measured, self.residual_plane == "corrected", _to_pixels(optics),
+                np.ascontiguousarray(optics.pixel_size, dtype=float), np.ascontiguousarray(optics.origin, dtype=float),
+                state.camera_table(len(optics.model.order)), state.rotation, state.position, state.points, network.images.cameras,
+            ),
+        )  # fmt: skip
 
     def _compiled(self, piece: Piece, network: Network, state: State, partials: bool) -> tuple[Floats, Floats, Floats, Floats] | None:
-        """Evaluate a piece by compiled loops; None for small groups, other cameras, and where a distortion cannot be inverted."""
+        """Evaluate a piece by the compiled loop; None where that cannot be done, or a distortion cannot be inverted."""
         n, k = len(piece.rows), piece.width
         count = n if partials else 0
-        out = np.empty((n, 2)), np.empty((count, 2, k)), np.empty((count, 2, 6)), np.empty((count, 2, 3))
-        done = self._loop(piece, network, state, partials, np.ones((1, 2)), np.arange(k), np.arange(6), *out)
-        return out if done else None
-
-    def _loop(
-        self, piece: Piece, network: Network, state: State, partials: bool, weights: Floats, cameras: Ints, images: Ints, *out: Floats
-    ) -> bool:
-        """Run the compiled loop over a piece, where there is one for its camera; `weights` are those of its rows, or one row for all."""
-        if len(self) < kernels.COMPILE_FROM:
-            return False
-        program, loop = kernels.Program.of(piece.optics), kernels.compiled()
-        if program is None or loop is None:
-            return False
-        optics, rows = piece.optics, piece.rows
-        together = len(rows) > 0 and rows[-1] - rows[0] == len(rows) - 1 and bool(np.all(np.diff(rows) == 1))
-        group = self.selected(slice(rows[0], rows[-1] + 1) if together else rows)  # a slice takes views
-        failed = loop(
-            program.steps, program.places, program.measured, self.residual_plane == "corrected", _to_pixels(optics),
-            np.ascontiguousarray(optics.pixel_size, dtype=float), np.ascontiguousarray(optics.origin, dtype=float),
-            state.camera_table(piece.width), state.rotation, state.position, state.points, network.images.cameras, group.images,
-            group.points, group.xy, weights, 0, len(rows), partials, cameras, images, *out,
-        )  # fmt: skip
-        return bool(failed < 0)
+        misclosure, out = np.empty((n, 2)), (np.empty((count, 2, k)), np.empty((count, 2, 6)), np.empty((count, 2, 3)))
+        evaluation = self.evaluation(piece.optics, network, state)
+        positions = [np.arange(k), np.arange(6), np.arange(3)]
+        done = evaluation is not None and evaluation(piece.rows, positions, misclosure, out if partials else (), np.ones((1, 2)))
+        return (misclosure, *out) if done else None
 
     def in_front(self, network: Network, state: State) -> NDArray[np.bool_]:
         """Return for each row whether its point lies in front of its camera."""
@@ -290,6 +306,19 @@ class ImagePoints:
         q[:, 0, 0], q[:, 1, 1] = s[:, 0] ** 2, s[:, 1] ** 2
         q[:, 0, 1] = q[:, 1, 0] = self.correlations[rows] * s[:, 0] * s[:, 1]
         return q
+
+
+def _together(rows: Any) -> Any:
+    """Return rows that follow each other as a slice, which takes views and no copies."""
+    if isinstance(rows, slice) or not len(rows) or rows[-1] - rows[0] != len(rows) - 1 or np.any(np.diff(rows) != 1):
+        return rows
+    return slice(rows[0], rows[-1] + 1)
+
+
+def _read_only(array: Any) -> Any:
+    """Return an array like those of a group, for which the loop is compiled."""
+    array.flags.writeable = False
+    return array
 
 
 def _to_pixels(optics: Optics) -> Floats:
