@@ -46,6 +46,7 @@ class BlockSolver:
     triangles: Floats
     panels: tuple[Floats, ...]
     size: Ints
+    rhs: Floats | None = None
     border_matrix: Floats | None = None
     border_inverse: Floats | None = None
 
@@ -80,13 +81,14 @@ class BlockSolver:
         rest = _rest_by_front(lin, structure, inverse)
         diagonal = np.where(inverse[structure.order] > 0.0, damping, 1.0)
         weak: list[tuple[int, Floats, bool]] = []
+        y, shares = lin.misclosure, [np.zeros(len(f.columns)) for f in structure.fronts]
 
         def factor(f: int) -> None:
             front = structure.fronts[f]
             n, p = len(front.columns), front.pivots
             matrix = np.zeros((n, n))
             for run in structure.runs_of_fronts[f]:
-                loops.accumulate(run.clusters, matrix, with_partials(arrays, lin, run.spans), triangles, bad, size)
+                loops.accumulate(run.clusters, matrix, y, shares[f], with_partials(arrays, lin, run.spans), triangles, bad, size)
             for at, jacobian in rest.get(f, ()):
                 _add_rows(matrix, at, jacobian)
             for child in front.children:
@@ -109,7 +111,9 @@ class BlockSolver:
             panels[f] = np.ascontiguousarray(matrix[:, :p])
 
         for run in structure.runs_of_fronts[-1]:
-            loops.accumulate(run.clusters, np.zeros((0, 0)), with_partials(arrays, lin, run.spans), triangles, bad, size)
+            loops.accumulate(
+                run.clusters, np.zeros((0, 0)), y, np.zeros(0), with_partials(arrays, lin, run.spans), triangles, bad, size
+            )  # fmt: skip
         with suppress(Singular):  # the reason is found below
             run_tree([len(f.children) for f in structure.fronts], [_after(f) for f in structure.fronts], factor, lin.workers)
         if bad.any():
@@ -121,12 +125,13 @@ class BlockSolver:
             border = updates[len(structure.fronts) - 1]
             border = np.tril(border) + np.tril(border, -1).T
         done = tuple(p for p in panels if p is not None)
-        return BlockSolver(lin, structure, inverse, arrays, loops, triangles, done, size, border)
+        rhs = _added(structure, shares) if loops.compiled else None
+        return BlockSolver(lin, structure, inverse, arrays, loops, triangles, done, size, rhs, border)
 
     def at(self, lin: Linearization | None) -> BlockSolver:
         """Return this factor for the system at a state nearby, as an approximate one; None only lets the old system go."""
         values = np.zeros(0) if lin is None else lin.values  # no view: it would keep the old ones
-        return replace(self, lin=cast(Linearization, lin), blocks_=self.blocks_._replace(values=values))
+        return replace(self, lin=cast(Linearization, lin), blocks_=self.blocks_._replace(values=values), rhs=None)
 
     @property
     def count(self) -> int:
@@ -171,15 +176,19 @@ class BlockSolver:
             x[-1] = 0.0
             return scaled[s.order, None] - self._scaled_transposed(self.lin.times(x[:-1], {"point"}), self._reduced_kinds)[s.order]
 
-        def forward(run: Run) -> Floats:
-            out = np.zeros(len(s.fronts[run.front].columns) if run.front >= 0 else 0)
-            self.loops.forward(run.clusters, y, with_partials(self.blocks_, self.lin, run.spans), self.triangles, out)
-            return out
+        if self.rhs is not None and y is self.lin.misclosure:
+            reduced = self.rhs.copy()
+        else:
+            shares = [np.zeros(len(f.columns)) for f in s.fronts]
 
-        reduced = np.zeros(len(s.order) + 1)  # the last is for parameters that are fixed
-        for run, part in zip(s.runs, for_each(s.runs, forward, self.lin.workers), strict=True):
-            if run.front >= 0:
-                reduced[s.fronts[run.front].columns] += part
+            def forward(f: int) -> None:
+                for run in s.runs_of_fronts[f]:
+                    part = with_partials(self.blocks_, self.lin, run.spans)
+                    self.loops.forward(run.clusters, y, part, self.triangles, shares[f])
+
+            for _ in for_each(range(len(s.fronts)), forward, self.lin.workers):
+                pass
+            reduced = _added(s, shares)
         for c, e, columns in self._rest:
             own = np.einsum("nmw,nm->nw", scaled_rows(c, e.rows, self.inverse), y[c.rows_of(e.rows)])
             np.add.at(reduced, columns, own)
@@ -378,6 +387,14 @@ class BlockSolver:
         return selected_inverse(self)
 
 
+def _added(structure: Structure, shares: list[Floats]) -> Floats:
+    """Add up what the clusters of each front leave for its columns, (U + 1,); the last is for parameters that are fixed."""
+    out = np.zeros(len(structure.order) + 1)
+    for front, share in zip(structure.fronts, shares, strict=True):
+        out[front.columns] += share
+    return out
+
+
 def _after(front: Front) -> list[int]:
     return [front.parent] if front.parent >= 0 else []
 
@@ -423,7 +440,9 @@ def _refuse_nodes(
     for f, front in enumerate(structure.fronts):
         part = np.zeros((len(front.columns), len(front.columns)))
         for run in structure.runs_of_fronts[f]:
-            loops.accumulate(run.clusters, part, with_partials(arrays, lin, run.spans), scratch, flags, size)
+            loops.accumulate(
+                run.clusters, part, lin.misclosure, np.zeros(len(part)), with_partials(arrays, lin, run.spans), scratch, flags, size
+            )
         for at, jacobian in rest.get(f, ()):
             _add_rows(part, at, jacobian)
         matrix[np.ix_(front.columns, front.columns)] += part

@@ -25,7 +25,7 @@ def slices(first: Ints, step: int) -> list[tuple[int, int]]:
     return [(a, min(a + step, count)) for a in range(0, count, step)]
 
 
-def clusters_of(first_block: Ints, chunk: Small, row: Small, seen: list[Ints], width: Ints) -> tuple[Ints, list[Ints], Bools]:
+def clusters_of(first_block: Ints, chunk: Small, row: Small, seen: list[Small], width: Ints) -> tuple[Ints, list[Ints], Bools]:
     """Gather neighbouring points that see nearly the same nodes.
 
     Parameters
@@ -33,7 +33,7 @@ def clusters_of(first_block: Ints, chunk: Small, row: Small, seen: list[Ints], w
     first_block : (P + 1,) int array
     chunk, row : (B,) int32 arrays
         Row blocks sorted by point.
-    seen : list of (N, parts) int arrays
+    seen : list of (N, parts) int32 arrays
         For each chunk the nodes of each row block, -1 = none.
     width : int array
         Of each node.
@@ -59,8 +59,7 @@ def clusters_of(first_block: Ints, chunk: Small, row: Small, seen: list[Ints], w
         base, number = np.nonzero(mark)
         ends, numbers = np.searchsorted(base, np.arange(b - a + 1)).tolist(), number.tolist()
         seen_by += [frozenset(numbers[i:j]) for i, j in pairwise(ends)]
-    touched = _touched(first_block, chunk, row, seen, width).astype(float) ** 2
-    effort = np.concatenate([[0.0], np.cumsum(touched)])
+    effort = np.concatenate([[0.0], np.cumsum(_touched(first_block, cuts[:-1], chunk, row, seen, width).astype(float) ** 2)])
     width_of = width.tolist()
     ends = cuts.tolist()
     widths = [sum([width_of[i] for i in s]) for s in seen_by]
@@ -78,21 +77,24 @@ def clusters_of(first_block: Ints, chunk: Small, row: Small, seen: list[Ints], w
             union, width, end = more, size, end + 1
         members.append(np.array(sorted(union), dtype=np.intp))
         first.append(ends[end])
-        mean = (effort[ends[end]] - effort[ends[k]]) / (ends[end] - ends[k])
+        mean = (effort[end] - effort[k]) / (end - k)
         sparse.append(width > SPARSE * float(np.sqrt(mean)))
         k = end
     return np.array(first, dtype=np.intp), members, np.array(sparse, dtype=bool)
 
 
-def _touched(first_block: Ints, chunk: Small, row: Small, seen: list[Ints], node_width: Ints) -> Ints:
-    """Return an upper bound of the columns that each point touches: shared nodes counted once if they come last."""
+def _touched(first_block: Ints, points: Ints, chunk: Small, row: Small, seen: list[Small], node_width: Ints) -> Ints:
+    """Return an upper bound of the columns that some points touch: shared nodes count with every block."""
     width = np.append(node_width, 0)
-    per_block = np.zeros(len(chunk), dtype=np.intp)
+    first, count = first_block[points], first_block[points + 1] - first_block[points]
+    blocks = np.arange(count.sum()) + np.repeat(first - np.cumsum(count) + count, count)
+    columns = np.zeros(len(blocks), dtype=np.intp)
     for i, numbers in enumerate(seen):
-        at = np.flatnonzero(chunk == i)
-        per_block[at] = width[numbers[row[at]]].sum(axis=1)
-    total = np.concatenate([[0], np.cumsum(per_block)])
-    return np.asarray(total[first_block[1:]] - total[first_block[:-1]])
+        at = np.flatnonzero(chunk[blocks] == i)
+        columns[at] = width[numbers[row[blocks[at]]]].sum(axis=1)
+    total = np.concatenate([[0], np.cumsum(columns)])
+    ends = np.cumsum(count)
+    return np.asarray(total[ends] - total[ends - count])
 
 
 def stretch(first: Ints, a: int, b: int, chunk: Small) -> list[tuple[int, Ints, Ints]]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, sparse
 
 from baarda.adjustment.linear_system import Linearization
 from baarda.geometry.rotation import skew
@@ -39,7 +40,7 @@ class Defect:
         return int(self.basis.shape[1])
 
 
-def similarity_directions(unknowns: Unknowns, state: State) -> Floats:
+def similarity_directions(unknowns: Unknowns, state: State, some: Ints | None = None) -> Floats:
     """Return how the unknowns change under shifts, rotations and scaling of the object space, (u, 7).
 
     Parameters
@@ -47,10 +48,12 @@ def similarity_directions(unknowns: Unknowns, state: State) -> Floats:
     unknowns : Unknowns
     state : State
         Coordinates near the origin (reduced to the centroid).
+    some : (k,) int array, optional
+        Unknowns; all, if not given.
 
     Returns
     -------
-    (u, 7) array
+    (u, 7) or (k, 7) array
         Rotation and scale are stated per mean distance from the origin, so that all columns are of one magnitude.
     """
 
@@ -58,72 +61,114 @@ def similarity_directions(unknowns: Unknowns, state: State) -> Floats:
         shift = np.broadcast_to(np.eye(3), (len(x), 3, 3))
         return np.concatenate([shift, -skew(x) / size, x[:, :, None] / size], axis=2)  # omega x X = -[X]x omega
 
+    def image(nodes: Ints) -> Floats:
+        turn = np.zeros((len(nodes), 3, 7))
+        turn[:, :, 3:6] = -state.rotation[nodes] / size
+        return np.concatenate([moved(state.position[nodes]), turn], axis=1)
+
     known = state.points[np.isfinite(state.points).all(axis=1)]
     everything = np.concatenate([known, state.position])
     size = (float(np.sqrt((everything**2).sum(axis=1).mean())) if len(everything) else 0.0) or 1.0
-    turn = np.zeros((len(state.position), 3, 7))
-    turn[:, :, 3:6] = -state.rotation / size
-    parts = {
-        "camera": np.zeros((len(unknowns["camera"].columns), 7)),
-        "image": np.concatenate([moved(state.position), turn], axis=1).reshape(-1, 7),
-        "point": moved(state.points).reshape(-1, 7),
-        **{d.kind: d.similarity(size) for d in state.declared},
-    }
-    out = np.zeros((unknowns.count, 7))
+    of_nodes = {"image": (6, image), "point": (3, lambda nodes: moved(state.points[nodes]))}
+    declared = {d.kind: d for d in state.declared}
+    place = np.arange(unknowns.count + 1) if some is None else np.full(unknowns.count + 1, -1)
+    if some is not None:
+        place[some] = np.arange(len(some))
+    place[-1] = -1
+    out = np.zeros((unknowns.count if some is None else len(some), 7))
     for group in unknowns.groups:
-        used = group.columns >= 0
-        out[group.columns[used]] = parts[group.kind][used]
+        to = place[group.columns]
+        if group.kind in of_nodes:
+            width, directions = of_nodes[group.kind]
+            to = to.reshape(-1, width)
+            nodes = np.flatnonzero((to >= 0).any(axis=1))
+            to, values = to[nodes].ravel(), directions(nodes).reshape(-1, 7)
+        else:
+            values = declared[group.kind].similarity(size) if group.kind in declared else np.zeros((len(to), 7))
+        out[to[to >= 0]] = values[to >= 0]
     return out
 
 
 SAMPLE = 10_000  # row blocks of a chunk that are looked at first
 
 
-def find_defect(lin: Linearization, state: State, tolerance: float = 1e-18) -> Defect:
-    """Find the transformations that change no observation.
+def find_defect(lin: Linearization, state: State) -> Defect:
+    """Find the transformations that change no observation: directions g with |A g|^2 <= 1e-18 times the sum of (A_ij g_j)^2.
 
     Parameters
     ----------
     lin : Linearization
     state : State
-    tolerance : float
-        A direction g is free if |A g|^2 <= tolerance * sum of (A_ij g_j)^2.
 
     Returns
     -------
     Defect
     """
+    if lin.count > 8 * SAMPLE:
+        a = lin.sample(SAMPLE).design
+        used, columns = np.unique(a.indices, return_inverse=True)
+        a = sparse.csr_array((a.data, columns, a.indptr), shape=(a.shape[0], len(used)))
+        squares, g = a.multiply(a).tocsr(), similarity_directions(lin.unknowns, state, used)
+        found = free_combinations(*products(lambda w: squares @ w, lambda w: squares.T @ w, lambda x: a @ x, g))
+        if not found[0].shape[1]:
+            return Defect(np.zeros((lin.unknowns.count, 0)), ())  # what some rows determine is determined
     g = similarity_directions(lin.unknowns, state)
-    if lin.count > 8 * SAMPLE and not _defect_of(lin.sample(SAMPLE), g, tolerance).count:
-        return Defect(np.zeros((len(g), 0)), ())  # what some rows determine is determined
-    return _defect_of(lin, g, tolerance)
+    combinations, free = free_combinations(*products(lin.row_sums, lin.column_sums, lin.times, g))
+    basis = g @ combinations
+    return Defect(np.linalg.qr(basis)[0] if basis.shape[1] else basis, free)
 
 
-def _defect_of(lin: Linearization, g: Floats, tolerance: float) -> Defect:
+def products(
+    row_sums: Callable[[Floats], Floats], column_sums: Callable[[Floats], Floats], times: Callable[[Floats], Floats], g: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Return the arguments of `free_combinations` for the directions g (u, 7).
+
+    Parameters
+    ----------
+    row_sums, column_sums, times : callable
+        Products of a design matrix, see `Linearization`.
+    g : (u, 7) array
+    """
     # Rows are brought to one size: what changes no observation does so whatever the weights are, and a weak observation must not drown.
-    size = lin.row_sums((g**2).sum(axis=1))
+    size = row_sums((g**2).sum(axis=1))
     weight_of_row = np.divide(1.0, np.sqrt(size), out=np.zeros_like(size), where=size > 0.0)
-    image = weight_of_row[:, None] * lin.times(g)
-    gross = (g * lin.column_sums(weight_of_row**2)[:, None]).T @ g
-    net = image.T @ image
+    image = weight_of_row[:, None] * times(g)
+    return (g * column_sums(weight_of_row**2)[:, None]).T @ g, image.T @ image, image
+
+
+def free_combinations(gross: Floats, net: Floats, image: Floats) -> tuple[Floats, tuple[str, ...]]:
+    """Return the combinations of the seven transformations that change no observation.
+
+    Parameters
+    ----------
+    gross, net : (7, 7) arrays
+        Sums over the observations of the products of what the transformations change through single unknowns, and in all.
+    image : (n, 7) array
+        What they change in all, or anything with the same products.
+
+    Returns
+    -------
+    (7, d) array
+    tuple of str
+        The transformations that are free each by itself.
+    """
     weight = np.sqrt(np.maximum(np.diag(gross), np.finfo(float).tiny))
     net, gross = net / np.outer(weight, weight), gross / np.outer(weight, weight)
     present = np.diag(gross) > 0.5
     if not present.any():
-        return Defect(np.zeros((len(g), 0)), ())
+        return np.zeros((7, 0)), ()
     sizes, directions = linalg.eigh(gross[np.ix_(present, present)])
     moving = sizes > 1e-10 * sizes[-1]  # other combinations of the seven move no unknown: fewer than seven unknowns can move
     whiten = directions[:, moving] / np.sqrt(sizes[moving])
-    reduced = whiten.T @ net[np.ix_(present, present)] @ whiten
-    if linalg.eigvalsh(reduced)[0] > 1e-8:
-        return Defect(np.zeros((len(g), 0)), ())
+    if linalg.eigvalsh(whiten.T @ net[np.ix_(present, present)] @ whiten)[0] > 1e-8:
+        return np.zeros((7, 0)), ()
     triangle = np.linalg.qr(image[:, present] / weight[present] @ whiten, mode="r")
     _, values, vectors = np.linalg.svd(triangle)  # not from the product: its rounding would hide a weak observation
-    small = np.append(values, np.zeros(len(vectors) - len(values))) <= np.sqrt(tolerance)
-    basis = (g[:, present] / weight[present]) @ (whiten @ vectors[small].T)
-    single = np.diag(net) <= tolerance
-    free = tuple(name for name, p, s in zip(FREEDOMS, present, single, strict=True) if p and s)
-    return Defect(np.linalg.qr(basis)[0] if basis.shape[1] else basis, free)
+    small = np.append(values, np.zeros(len(vectors) - len(values))) <= 1e-9
+    combinations = np.zeros((7, int(small.sum())))
+    combinations[present] = (whiten @ vectors[small].T) / weight[present][:, None]
+    single = np.diag(net) <= 1e-18
+    return combinations, tuple(name for name, p, s in zip(FREEDOMS, present, single, strict=True) if p and s)
 
 
 def minimal_columns(defect: Defect, lin: Linearization, candidates: Ints) -> Ints:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 REUSE = 1e-4  # relative step below which the factor of the last iteration serves the next ones
+SCALED = 0.1  # relative step from which the columns are scaled anew
 NEAR = 1e-3  # relative step below which a full step is not tried before it is taken
 BEND = 1e-7  # relative step above which steps are bent
 
@@ -144,9 +145,13 @@ def iterate(
     """
     control = Control(float(lin.misclosure @ lin.misclosure), lin.count, settings, settings.progress)
     before: Floats | None = None  # the last full step, as a change of the observations
+    centres = centres_of_rays(groups.groups, state)
 
     def moved(step: Floats) -> State:
-        return state.moved(unknowns, step, centres_of_rays(groups.groups, state))
+        return state.moved(unknowns, step, centres)
+
+    def linearized(there: State, scale: Floats | None) -> Linearization:
+        return replace(linearize(network, there, unknowns, groups, workers), near=scale)
 
     def misclosures(step: Floats) -> tuple[State, Floats, float]:
         trial = moved(step)
@@ -174,9 +179,9 @@ def iterate(
             step, plain = _bent(lin, solver, datum, step, change, lambda x: misclosures(x)[1]), False
         near = control.near(relative)
         if near:  # linearised at once
-            trial, solver = moved(step), solver.at(None)
+            trial, solver, scale = moved(step), solver.at(None), lin.scale
             del lin  # its memory is needed
-            lin = linearize(network, trial, unknowns, groups, workers)
+            lin = linearized(trial, scale)
             with np.errstate(over="ignore"):
                 value = float(lin.misclosure @ lin.misclosure)
         else:
@@ -185,14 +190,15 @@ def iterate(
         if not control.takes(value, predicted, relative):
             before = solver = None
             if near:
-                lin = linearize(network, state, unknowns, groups, workers)
+                lin = linearized(state, scale)
             continue
         state = trial
         before = change if full and lengthened == 1.0 else None
         solver = solver.at(None) if full and relative <= REUSE else None
         if not near:
+            scale = lin.scale
             del lin
-            lin = linearize(network, state, unknowns, groups, workers)
+            lin = linearized(state, scale if relative < SCALED else None)
         if control.settled(relative, plain) and (full or _full_step(lin, tied, factor) <= 1e-6):
             return state, lin, control.history, True
         control.relax(relative)

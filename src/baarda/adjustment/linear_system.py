@@ -151,6 +151,8 @@ class Linearization:
         The stored partials of all chunks and parts, one after the other.
     workers : int or None
         Number of threads; None = one for each core. Nothing depends on it but the time.
+    near : (u,) array or None
+        The scale of a system nearby, which does for this one.
     """
 
     unknowns: Unknowns
@@ -158,6 +160,7 @@ class Linearization:
     count: int
     values: Floats
     workers: int | None = None
+    near: Floats | None = None
 
     @property
     def stored(self) -> bool:
@@ -194,7 +197,7 @@ class Linearization:
                 np.multiply(p.jacobian, w[:, :, None], out=view)
                 parts.append(replace(p, jacobian=view))
             chunks.append(replace(c, misclosure=c.misclosure * w, parts=tuple(parts)))
-        return replace(self, chunks=tuple(chunks), values=values)
+        return replace(self, chunks=tuple(chunks), values=values, near=None)
 
     def sample(self, most: int) -> Linearization:
         """Return a part of the rows: at most some `most` row blocks of each chunk, those that end at a fixed parameter first.
@@ -325,6 +328,8 @@ class Linearization:
 
     @cached_property
     def scale(self) -> Floats:
-        """The Euclidean norms of the columns of the design matrix, (u,); 1 where a column is zero."""
+        """The Euclidean norms of the columns of the design matrix, (u,), or of one nearby; 1 where a column is zero."""
+        if self.near is not None:
+            return self.near
         norms = np.sqrt(self.column_sums(np.ones(self.count)))
         return np.where(norms > 0.0, norms, 1.0)

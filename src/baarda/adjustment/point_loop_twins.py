@@ -97,17 +97,17 @@ def orthogonal(a: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     return q, r, bad
 
 
-def accumulate(clusters: Ints, front: Floats, b: Blocks, r: Floats, bad: NDArray[np.bool_], size: Ints) -> None:
-    """As `point_loops._accumulate`."""
+def accumulate(clusters: Ints, front: Floats, y: Floats, rhs: Floats, b: Blocks, r: Floats, bad: NDArray[np.bool_], size: Ints) -> None:
+    """As `point_loops._accumulate`, without right-hand sides."""
     for c in clusters:
         some = slice(b.first_point[c], b.first_point[c + 1])
-        r[some], bad[some], groups, y = _cluster(c, b)
-        width = y.shape[1]
+        r[some], bad[some], groups, lines = _cluster(c, b)
+        width = lines.shape[1]
         own = np.zeros((width + 1, width + 1))
         for g in groups:
             np.add.at(own, (g.at[:, :, None], g.at[:, None, :]), np.einsum("nmi,nmj->nij", g.h, g.h))
         rows = b.cluster_rows[b.first_column[c] : b.first_column[c + 1]]
-        front[np.ix_(rows, rows)] += np.tril(own[:width, :width] - y.T @ y)
+        front[np.ix_(rows, rows)] += np.tril(own[:width, :width] - lines.T @ lines)
 
 
 def statistics(clusters: Ints, z: Floats, b: Blocks, hat: Floats, points: Floats, size: Ints) -> None:

@@ -190,13 +190,13 @@ def _touch(stack: Ints, touched: int, begins: Ints, count: int) -> int:
     return touched
 
 
-def _accumulate(clusters: Ints, front: Floats, b: Any, r: Floats, bad: NDArray[np.bool_], size: Ints) -> None:
-    """Add H'H - Y'Y of clusters to the lower triangle of a front; store the triangular factors (P, 3, 3) of their points."""
+def _accumulate(clusters: Ints, front: Floats, y: Floats, rhs: Floats, b: Any, r: Floats, bad: NDArray[np.bool_], size: Ints) -> None:
+    """Add H'H - Y'Y of clusters to the lower triangle of a front, and what A'y leaves to `rhs`; store the triangular factors (P, 3, 3)."""
     table, first_block, chunk, first_point, first_column = b.table, b.first_block, b.chunk, b.first_point, b.first_column
     cluster_rows, is_sparse, inverse = b.cluster_rows, b.sparse, b.inverse
-    values, starts, row, point_inverse, prior = b.values, b.starts, b.row, b.point_inverse, b.prior
-    q = np.empty((size[0], 3))
-    buffer, square, scale = np.empty(size[1]), np.empty(size[2]), np.empty(size[2])
+    values, starts, row, point_inverse, prior, scalar = b.values, b.starts, b.row, b.point_inverse, b.prior, b.scalar
+    q, left = np.empty((size[0], 3)), np.empty(size[0] + 1)
+    buffer, square, scale, right = np.empty(size[1]), np.empty(size[2]), np.empty(size[2]), np.empty(size[2])
     stack, begins = np.empty((size[3], 2), np.int64), np.empty(3 * size[4], np.int64)
     upper, lower = np.empty(size[5]), np.empty(size[5])
     for c in clusters:
@@ -207,25 +207,44 @@ def _accumulate(clusters: Ints, front: Floats, b: Any, r: Floats, bad: NDArray[n
         stride = np.uint64(width)
         for x in range(width):
             scale[x] = inverse[offset + x]
-        y = buffer[: height * width]
-        y[:] = 0.0
+            right[x] = 0.0
+        lines = buffer[: height * width]
+        lines[:] = 0.0
         own = square[: width * width]
         own[:] = 0.0
         for p in range(first_point[c], first_point[c + 1]):
             bad[p] = _factor_point(p, values, table, first_block, chunk, row, point_inverse, prior, q, 0, r, p) < 0
             if width == 0:
                 continue
+            t0 = t1 = t2 = 0.0
+            n = 0
+            for i in range(first_block[p], first_block[p + 1]):
+                k = chunk[i]
+                at = scalar[table[k, 4] + row[i]]
+                for e in range(table[k, 0]):
+                    left[n] = y[at + e]
+                    t0 += q[n, 0] * y[at + e]
+                    t1 += q[n, 1] * y[at + e]
+                    t2 += q[n, 2] * y[at + e]
+                    n += 1
             y0 = 0 if sparse else 3 * (p - first_point[c]) * width
             n = touched = 0
             for i in range(first_block[p], first_block[p + 1]):
                 k = chunk[i]
                 m = table[k, 0]
                 for e in range(0, m, 2):
-                    count = _lines_and_y(values, table, starts, k, row[i], e, scale, upper, lower, begins, y, y0, width, q, n)
+                    count = _lines_and_y(values, table, starts, k, row[i], e, scale, upper, lower, begins, lines, y0, width, q, n)
+                    d0 = left[n] - (q[n, 0] * t0 + q[n, 1] * t1 + q[n, 2] * t2)
+                    d1 = 0.0
+                    if e + 1 < m:
+                        d1 = left[n + 1] - (q[n + 1, 0] * t0 + q[n + 1, 1] * t1 + q[n + 1, 2] * t2)
                     n += min(2, m - e)
                     if sparse and e == 0:
                         touched = _touch(stack, touched, begins, count)
                     for g in range(0, count, 3):
+                        to, o = np.uint64(begins[g]), np.uint64(begins[g + 2])
+                        for x in range(np.uint64(begins[g + 1])):
+                            right[to + x] += upper[o + x] * d0 + lower[o + x] * d1
                         for g2 in range(0, count, 3):
                             if begins[g2] > begins[g]:
                                 continue
@@ -243,21 +262,24 @@ def _accumulate(clusters: Ints, front: Floats, b: Any, r: Floats, bad: NDArray[n
                             to = np.uint64(stack[g, 0] * width + stack[g2, 0])
                             s2 = np.uint64(stack[g2, 0])
                             for x in range(np.uint64(stack[g, 0]), np.uint64(stack[g, 0] + stack[g, 1])):
-                                u0, u1, u2 = y[x], y[x + stride], y[x + stride + stride]
+                                u0, u1, u2 = lines[x], lines[x + stride], lines[x + stride + stride]
                                 for x2 in range(np.uint64(stack[g2, 1])):
-                                    own[to + x2] -= u0 * y[s2 + x2] + u1 * y[s2 + stride + x2] + u2 * y[s2 + stride + stride + x2]
+                                    own[to + x2] -= (
+                                        u0 * lines[s2 + x2] + u1 * lines[s2 + stride + x2] + u2 * lines[s2 + stride + stride + x2]
+                                    )
                                 to += stride
                 for g in range(touched):
                     for a in range(3):
                         for x in range(a * width + stack[g, 0], a * width + stack[g, 0] + stack[g, 1]):
-                            y[x] = 0.0
+                            lines[x] = 0.0
         if width == 0:
             continue
         if not sparse:
-            table_of_y = y.reshape((height, width))
+            table_of_y = lines.reshape((height, width))
             own -= np.dot(table_of_y.T, table_of_y).reshape(width * width)
         for x in range(width):
             fx = cluster_rows[offset + x]
+            rhs[fx] += right[x]
             for x2 in range(x + 1):
                 front[fx, cluster_rows[offset + x2]] += own[x * width + x2]
 

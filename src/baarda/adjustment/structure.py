@@ -305,10 +305,13 @@ class _Nodes:
     def columns_of(self, node: int) -> Ints:
         return self.unknowns[self.offset[node] : self.offset[node + 1]]
 
-    def of_chunk(self, c: Chunk) -> Ints:
+    def of_chunk(self, c: Chunk) -> Small:
         """Return the (N, parts) node numbers of row blocks."""
-        numbers = [self.number[p.kind][p.nodes] if len(p.positions) else np.full(len(c.first), -1) for p in c.parts]
-        return np.stack(numbers, axis=1)
+        out = np.full((len(c.first), len(c.parts)), -1, dtype=np.int32)
+        for j, p in enumerate(c.parts):
+            if len(p.positions) and (self.number[p.kind] >= 0).any():
+                out[:, j] = self.number[p.kind][p.nodes]
+        return out
 
     def places(self, members: list[Ints], centres: Floats) -> Floats | None:
         """Return for each node the mean of the centres of its clusters; None where there are none."""
@@ -342,17 +345,17 @@ def _point_part(c: Chunk, inner: Bools) -> int:
 
 def _blocks_by_point(owner: list[Ints], points: int) -> tuple[Ints, Small, Small]:
     """Sort the row blocks by their inner point: first block of each point, chunk and row of each block."""
-    blocks = [np.flatnonzero(o >= 0) for o in owner]
-    owners = _joined([o[b] for o, b in zip(owner, blocks, strict=True)])
-    chunk = _joined([np.full(len(b), i) for i, b in enumerate(blocks)]).astype(np.int32)
-    row = _joined(blocks).astype(np.int32)
+    blocks = [np.flatnonzero(o >= 0).astype(np.int32) for o in owner]
+    owners = np.concatenate([o[b] for o, b in zip(owner, blocks, strict=True)])
+    chunk = np.repeat(np.arange(len(blocks), dtype=np.int32), [len(b) for b in blocks])
+    row = np.concatenate(blocks)
     if np.any(np.diff(owners) < 0):
         order = np.argsort(owners, kind="stable")
         owners, chunk, row = owners[order], chunk[order], row[order]
     return np.searchsorted(owners, np.arange(points + 1)).astype(np.intp), chunk, row
 
 
-def _distinct(sets: Ints) -> list[Ints]:
+def _distinct(sets: Small) -> list[Ints]:
     """Return the different sets of nodes in the rows of an array; -1 = none."""
     rows = np.unique(np.sort(sets, axis=1), axis=0)
     return [np.unique(m[m >= 0]) for m in rows if (m >= 0).any()]
@@ -433,7 +436,7 @@ def _fronts(parts: list[Ints], front_nodes: list[Ints], home: Ints, nodes: _Node
     return tuple(out)
 
 
-def _starts(seen: list[Ints], chunk: Small, row: Small, first: Ints, members: list[Ints], widths: list[Ints], count: int) -> Small:
+def _starts(seen: list[Small], chunk: Small, row: Small, first: Ints, members: list[Ints], widths: list[Ints], count: int) -> Small:
     """Return for each chunk, one after the other, where the columns of each part begin in the cluster of the block."""
     sizes = np.cumsum([0, *(numbers.size for numbers in seen)])
     flat = np.full(sizes[-1], -1, dtype=np.int32)
@@ -448,7 +451,7 @@ def _starts(seen: list[Ints], chunk: Small, row: Small, first: Ints, members: li
     return flat
 
 
-def _rest(i: int, rows: Ints, sets: Ints, c: Chunk, position: Ints, front_of: Ints, rows_in: _RowsInFronts) -> Rest:
+def _rest(i: int, rows: Ints, sets: Small, c: Chunk, position: Ints, front_of: Ints, rows_in: _RowsInFronts) -> Rest:
     late = np.append(position, len(position))[sets]
     earliest = np.argmin(late, axis=1)
     first = sets[np.arange(len(sets)), earliest]

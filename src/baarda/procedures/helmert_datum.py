@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from baarda.adjustment.datum import FREEDOMS
+from baarda.adjustment.datum import free_combinations
 from baarda.adjustment.solve import Settings
 from baarda.errors import DatumDefect
 from baarda.procedures import helmert_part as tasks
@@ -52,27 +52,10 @@ def find_defect(parts: Parts, stands: Handles) -> tuple[Floats, tuple[str, ...],
     """Return the free combinations (7, d) of the similarity directions, as `baarda.adjustment.datum.find_defect`."""
     sums = parts.all(tasks.datum_sums, stands, parts.joint.size)
     gross, net = (sum(getattr(s, name) for s in sums) for name in ("gross", "net"))
-    none: tuple[Floats, tuple[str, ...], list[tasks.DatumSums]] = (np.zeros((7, 0)), (), sums)
-    weight = np.sqrt(np.maximum(np.diag(gross), np.finfo(float).tiny))
-    net, gross = net / np.outer(weight, weight), gross / np.outer(weight, weight)
-    present = np.diag(gross) > 0.5
-    if not present.any():
-        return none
-    sizes, axes = linalg.eigh(gross[np.ix_(present, present)])
-    moving = sizes > 1e-10 * sizes[-1]
-    whiten = axes[:, moving] / np.sqrt(sizes[moving])
-    if linalg.eigvalsh(whiten.T @ net[np.ix_(present, present)] @ whiten)[0] > 1e-8:
-        return none
-    rows = np.concatenate([s.triangle for s in sums])[:, present] / weight[present] @ whiten
-    _, values, vectors = np.linalg.svd(np.linalg.qr(rows, mode="r"))
-    small = np.append(values, np.zeros(len(vectors) - len(values))) <= 1e-9
-    basis = np.zeros((7, int(small.sum())))
-    basis[present] = (whiten @ vectors[small].T) / weight[present][:, None]
+    basis, free = free_combinations(gross, net, np.concatenate([s.triangle for s in sums]))
     if basis.shape[1]:
         everything = np.concatenate([s.all_unknowns for s in sums]) @ basis
         basis = basis @ np.linalg.inv(np.linalg.qr(everything, mode="r"))
-    single = np.diag(net) <= 1e-18
-    free = tuple(name for name, p, s in zip(FREEDOMS, present, single, strict=True) if p and s)
     return basis, free, sums
 
 

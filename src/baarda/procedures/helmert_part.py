@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baarda.adjustment.block import BlockSolver
-from baarda.adjustment.datum import similarity_directions
+from baarda.adjustment.datum import products, similarity_directions
 from baarda.adjustment.iteration import centres_of_rays
 from baarda.adjustment.linearize import check_finite, whitened_misclosures
 from baarda.adjustment.solve import Settings
@@ -147,14 +147,11 @@ def datum_sums(stand: Stand, size: float) -> DatumSums:
     """Return the sums of a part by which the datum defect is found; triangles are those of QR factorisations."""
     part, lin = stand.part, stand.lin
     g = directions(part, stand.state, size)
-    rows = lin.row_sums((g**2).sum(axis=1))
-    weight = np.divide(1.0, np.sqrt(rows), out=np.zeros_like(rows), where=rows > 0.0)
-    image = weight[:, None] * lin.times(g)
-    gross = (g * lin.column_sums(weight**2)[:, None]).T @ g
+    gross, net, image = products(lin.row_sums, lin.column_sums, lin.times, g)
     stand.rest()
     return DatumSums(
         gross,
-        image.T @ image,
+        net,
         _triangle(image),
         _triangle(g[part.owned]),
         _triangle(g[_of_kind(part, "point")]),
