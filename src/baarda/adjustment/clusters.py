@@ -15,7 +15,7 @@ Bools = NDArray[np.bool_]
 
 MOST = 1024  # points of the largest cluster
 LARGEST = 700_000  # points times columns of the largest cluster
-GROWTH = 1.1  # a cluster may grow while its width stays below this multiple of its widest part
+OVERHEAD = 12  # what a cluster costs whatever its points are, in points
 SPARSE = 3.5  # clusters wider than this multiple of what a point of theirs touches are treated point by point
 
 
@@ -67,14 +67,14 @@ def clusters_of(first_block: Ints, chunk: Small, row: Small, seen: list[Small], 
     k = 0
     while k < len(seen_by):
         union, end = seen_by[k], k + 1
-        width = widest = widths[k]
+        width = widths[k]
         while end < len(seen_by) and ends[end + 1] - ends[k] <= MOST:
-            more = union | seen_by[end]
             size = width + sum([width_of[i] for i in seen_by[end] - union])
-            widest = max(widest, widths[end])
-            if size > GROWTH * widest or size * (ends[end + 1] - ends[k]) > LARGEST:
+            points, more = ends[end] - ends[k], ends[end + 1] - ends[end]
+            apart = width**2 * (points + OVERHEAD) + widths[end] ** 2 * (more + OVERHEAD)
+            if size**2 * (points + more + OVERHEAD) > apart or size * (points + more) > LARGEST:
                 break
-            union, width, end = more, size, end + 1
+            union, width, end = union | seen_by[end], size, end + 1
         members.append(np.array(sorted(union), dtype=np.intp))
         first.append(ends[end])
         mean = (effort[end] - effort[k]) / (end - k)

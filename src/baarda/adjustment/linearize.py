@@ -109,7 +109,7 @@ def linearize(
     arranged = groups if isinstance(groups, Arrangement) else Arrangement.of(groups)
     kept = kept_positions(unknowns)
     fillings: list[_Filling | Chunk] = []
-    large = _large(arranged)
+    large = _large(arranged, network)
     group: Any
     for g, group in enumerate(arranged.sorted):
         first = arranged.first[g]
@@ -147,12 +147,26 @@ def _sorted(keys: Ints, count: int) -> Ints:
     return np.asarray(sparse.csr_array((ones, (keys, np.arange(n))), shape=(count, n)).indices, dtype=np.intp)
 
 
-def _large(arranged: Arrangement) -> set[int]:
+def is_evaluated(group: Any, network: Network) -> bool:
+    """Return whether the partials of a group, if it is sorted by points, are evaluated wherever they are needed instead of being stored.
+
+    Parameters
+    ----------
+    group : Kind
+    network : Network
+    """
+    if not hasattr(group, "pieces") or len(group) < EVALUATED_FROM or np.any(group.correlations):
+        return False
+    stretches = group.by_optics(network)
+    return len(stretches) <= MANY_OPTICS and all(group.can_be_evaluated(optics) for optics, _ in stretches)
+
+
+def _large(arranged: Arrangement, network: Network) -> set[int]:
     """Return the sorted groups whose partials are not to be stored."""
     if not arranged.ranked:
         return set()
     groups: list[Any] = list(arranged.sorted)
-    large = {g for g, group in enumerate(groups) if hasattr(group, "pieces") and len(group) >= EVALUATED_FROM}
+    large = {g for g, group in enumerate(groups) if is_evaluated(group, network)}
     others = [group for g, group in enumerate(groups) if g not in large and getattr(group, "kind", "point") == "point"]
     beside = sum(len(group) * len(group.components) for group in others)
     return large if beside <= FEW_BESIDE else set()
@@ -163,14 +177,12 @@ def _evaluated(
 ) -> list[Chunk] | None:
     """Return a chunk for each optics whose partials are evaluated wherever they are needed; None where that cannot be done."""
     chunks = []
-    stretches = group.by_optics(network)
-    for optics, rows in stretches:
+    for optics, rows in group.by_optics(network):
         some, evaluation = slice(int(rows[0]), int(rows[-1]) + 1), group.evaluation(optics, network, state)
         count = some.stop - some.start
         width = {"camera": len(optics.model.order), "image": 6, "point": 3}
         positions = [kept.get(key, np.zeros(0, dtype=np.intp)) for key in width.items()]
-        whole = len(positions[2]) == 3 and not np.any(group.correlations[some])
-        if evaluation is None or len(stretches) > MANY_OPTICS or count != len(rows) or not whole:
+        if evaluation is None or len(positions[2]) != 3 or count != len(rows):
             return None
         misclosure = np.empty((count, 2))
         rays = Rays(evaluation, some.start, count, tuple(positions))

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from baarda.adjustment.linearize import is_evaluated
 from baarda.adjustment.structure import Structure
 from baarda.errors import NotEnoughMemory
 from baarda.executors import memory_limit
-from baarda.network import Unknowns
+from baarda.network import Network, Unknowns
 from baarda.observations import Kind
 
 DOUBLE = 8
@@ -49,20 +50,22 @@ def _resident() -> float:
     return float(pages) * float(os.sysconf("SC_PAGE_SIZE"))
 
 
-def of_rows(unknowns: Unknowns, groups: Sequence[Kind]) -> float:
-    """Return the bytes of partials, misclosures, nodes and results of all observations.
+def of_rows(unknowns: Unknowns, groups: Sequence[Kind], network: Network) -> float:
+    """Return the bytes of partials that are stored, misclosures, nodes and results of all observations.
 
     Parameters
     ----------
     unknowns : Unknowns
     groups : sequence of Kind
+    network : Network
     """
     camera = unknowns["camera"]
     widths = np.diff(camera.offsets)
     free = [(camera.columns[a:b] >= 0).sum() for a, b in zip(camera.offsets[:-1], camera.offsets[1:], strict=True)]
     width = 9 + (int(max(free)) if len(widths) else 0)
-    scalars = sum(len(g) * len(g.components) for g in groups)
-    return float(DOUBLE * scalars * (width + 12) + DOUBLE * unknowns.count * 12)
+    scalars = [len(g) * len(g.components) for g in groups]
+    stored = sum(n for n, g in zip(scalars, groups, strict=True) if not is_evaluated(g, network))
+    return float(DOUBLE * (sum(scalars) * 12 + stored * width) + DOUBLE * unknowns.count * 12)
 
 
 def of_dense(unknowns: Unknowns) -> float:

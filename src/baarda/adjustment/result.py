@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from baarda.adjustment import estimates, tables
 from baarda.adjustment.covariance import Cofactors
 from baarda.adjustment.datum import Datum
-from baarda.adjustment.linear_system import Linearization
+from baarda.adjustment.linear_system import Chunk, Linearization
 from baarda.adjustment.linearize import offsets_of
 from baarda.adjustment.solver import Solver
 from baarda.errors import UsageError
@@ -137,10 +137,13 @@ class Adjustment:
         """v = adjusted - observed of all n observations, each in its unit."""
         out = np.empty(self.count)
         for c in self.lin.chunks:
-            if c.correlated:
-                out[c.rows] = -(c.factor @ c.misclosure[:, :, None])[:, :, 0]
-            else:
-                out[c.rows] = -np.einsum("nii->ni", c.factor) * c.misclosure
+            correlated = c.correlated
+            for some in c.pieces():
+                factor, misclosure = c.factor[some], c.misclosure[some]
+                if correlated:
+                    out[c.rows_of(some)] = -(factor @ misclosure[:, :, None])[:, :, 0]
+                else:
+                    out[c.rows_of(some)] = -np.einsum("nii->ni", factor) * misclosure
         return out
 
     @cached_property
@@ -155,23 +158,33 @@ class Adjustment:
         with threadpool_limits(limits=1, user_api="blas"):
             hats = self.solver.hat()
         for c, hat in zip(self.lin.chunks, hats, strict=True):
-            if not c.correlated and c.controlled is None:
-                sigma = np.einsum("nii->ni", c.factor)
-                share = 1.0 - np.einsum("nii->ni", hat)
-                found = (share * sigma**2, share, share / sigma**2, -c.misclosure / sigma, 1.0 / sigma**2)
-                for name, values in zip(("qvv", "redundancy", "pqvvp", "pv", "weight"), found, strict=True):
-                    out[name][c.rows] = values
-                continue
-            rest = (np.eye(hat.shape[1]) if c.controlled is None else c.controlled) - hat
-            inverse = np.linalg.inv(c.factor)
-            left = c.factor @ rest
-            weighted = inverse.transpose(0, 2, 1)
-            out["qvv"][c.rows] = np.einsum("nij,nij->ni", left, c.factor)
-            out["redundancy"][c.rows] = np.einsum("nij,nji->ni", left, inverse)
-            out["pqvvp"][c.rows] = np.einsum("nij,nji->ni", weighted @ rest, inverse)
-            out["weight"][c.rows] = np.einsum("nij,nji->ni", weighted, inverse)
-            out["pv"][c.rows] = -(weighted @ c.misclosure[:, :, None])[:, :, 0]
+            plain = not c.correlated and c.controlled is None
+            for some in c.pieces():
+                self._put(out, c, some, hat[some], plain)
         return out
+
+    @staticmethod
+    def _put(out: dict[str, Floats], c: Chunk, some: slice, hat: Floats, plain: bool) -> None:
+        """Store the diagonals of some row blocks of a chunk; `plain`: uncorrelated, and controlled by the observation equations alone."""
+        factor, misclosure, rows = c.factor[some], c.misclosure[some], c.rows_of(some)
+        if plain:
+            sigma = np.einsum("nii->ni", factor)
+            share = 1.0 - np.einsum("nii->ni", hat)
+            found = (share * sigma**2, share, share / sigma**2, -misclosure / sigma, 1.0 / sigma**2)
+        else:
+            rest = (np.eye(hat.shape[1]) if c.controlled is None else c.controlled[some]) - hat
+            inverse = np.linalg.inv(factor)
+            left = factor @ rest
+            weighted = inverse.transpose(0, 2, 1)
+            found = (
+                np.einsum("nij,nij->ni", left, factor),
+                np.einsum("nij,nji->ni", left, inverse),
+                np.einsum("nij,nji->ni", weighted @ rest, inverse),
+                -(weighted @ misclosure[:, :, None])[:, :, 0],
+                np.einsum("nij,nji->ni", weighted, inverse),
+            )
+        for name, values in zip(("qvv", "redundancy", "pqvvp", "pv", "weight"), found, strict=True):
+            out[name][rows] = values
 
     @property
     def redundancy_numbers(self) -> Floats:

@@ -156,7 +156,9 @@ def _adjust(network: Network, settings: Settings) -> Adjustment:
     start = State.of(prepared)
     kind = settings.solver if settings.solver != "auto" else "dense" if unknowns.count <= DENSE_LIMIT else "block"
     memory.check(
-        memory.of_rows(unknowns, groups) + (memory.of_dense(unknowns) if kind == "dense" else 0.0), "the observations", settings.tell
+        memory.of_rows(unknowns, groups, prepared) + (memory.of_dense(unknowns) if kind == "dense" else 0.0),
+        "the observations",
+        settings.tell,
     )
     rank = rank_for(groups, start.points)
     arranged = Arrangement.of(groups, rank if kind == "block" else None, prepared)

@@ -265,12 +265,14 @@ class ImagePoints:
         cameras[:] = network.images.cameras[images]
         return self.sigmas[piece.rows]
 
+    def can_be_evaluated(self, optics: Optics) -> bool:
+        """Return whether there is a compiled loop for so many rows of these optics."""
+        return len(self) >= kernels.COMPILE_FROM and kernels.Program.of(optics) is not None and kernels.compiled() is not None
+
     def evaluation(self, optics: Optics, network: Network, state: State) -> Evaluation | None:
         """Return what evaluates rows of these optics at a state by the compiled loop; None for small groups and cameras without one."""
-        if len(self) < kernels.COMPILE_FROM:
-            return None
         program, loop = kernels.Program.of(optics), kernels.compiled()
-        if program is None or loop is None:
+        if program is None or not self.can_be_evaluated(optics):
             return None
         return Evaluation(
             self, loop,

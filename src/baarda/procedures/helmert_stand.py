@@ -138,7 +138,7 @@ class Part:
         return Part, (self.source,)
 
     def __sizeof__(self) -> int:
-        return int(memory.of_rows(self.unknowns, self.groups))
+        return int(memory.of_rows(self.unknowns, self.groups, self.network))
 
     def _labels(self, kind: str) -> dict[str, int]:
         found = self._index.get(kind)
@@ -156,7 +156,7 @@ class Part:
         return self._labels(kind)[label]
 
     def _check_rows(self) -> None:
-        self._refuse(memory.of_rows(self.unknowns, self.groups), "the observations")
+        self._refuse(memory.of_rows(self.unknowns, self.groups, self.network), "the observations")
 
     def _refuse(self, needed: float, what: str) -> None:
         limit, held, there = memory_limit(), resident(), memory.available()
@@ -175,7 +175,7 @@ class Part:
         """Return the pattern of the part's system, with its border last."""
         if self._structure is None:
             self._structure = analyse(lin, self.rank, self.start.points, border=self.border)
-            self._refuse(self.needed - memory.of_rows(self.unknowns, self.groups), "the factor and the tables")
+            self._refuse(self.needed - memory.of_rows(self.unknowns, self.groups, self.network), "the factor and the tables")
         return self._structure
 
     @property
@@ -183,7 +183,7 @@ class Part:
         """Bytes of the part's observations, factor and tables."""
         fronts = 0.0 if self._structure is None else memory.of_fronts(self._structure) + 8.0 * 2 * len(self.border) ** 2
         rows = sum(len(g) * len(g.components) for g in self.groups)
-        return memory.of_rows(self.unknowns, self.groups) + fronts + TABLES * rows
+        return memory.of_rows(self.unknowns, self.groups, self.network) + fronts + TABLES * rows
 
 
 class Stand:
