@@ -230,9 +230,12 @@ class Linearization:
     def misclosure(self) -> Floats:
         """The whitened misclosures, (n,)."""
         out = np.empty(self.count)
-        for c in self.chunks:
-            for r, own in enumerate(c.misclosure.T):
-                out[c.first + r] = own
+
+        def put(c: Chunk, some: slice) -> None:
+            for r, own in enumerate(c.misclosure[some].T):
+                out[c.first[some] + r] = own
+
+        self._each(put)
         return out
 
     @cached_property

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from baarda.adjustment.linear_system import PIECE, Chunk, Linearization, Part, split
-from baarda.adjustment.workers import for_each
+from baarda.adjustment.workers import for_each, scratch
 from baarda.errors import InputError, UsageError
 from baarda.network import Network, State, UnknownGroup, Unknowns
 from baarda.observations import Kind, Rows
@@ -218,7 +218,7 @@ class Rays:
             n, at = stop - start, slice(self.begin + start, self.begin + stop)
         else:
             n, at = len(rows), self.begin + rows
-        if not self.evaluation(at, self.positions, np.empty((n, 2)), split(values, n, 2, self.positions)):
+        if not self.evaluation(at, self.positions, scratch("misclosures", 2 * n).reshape(n, 2), split(values, n, 2, self.positions)):
             raise UsageError(f"{self.evaluation.group.name}: a distortion cannot be inverted")
 
 

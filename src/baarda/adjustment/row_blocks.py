@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from baarda.adjustment.linear_system import Chunk, Linearization, split
 from baarda.adjustment.structure import Structure
+from baarda.adjustment.workers import scratch
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -95,7 +96,7 @@ def blocks_of(lin: Linearization, structure: Structure, inverse: Floats, damping
 
 
 def with_partials(blocks: Blocks, lin: Linearization, spans: Ints) -> Blocks:
-    """Return the arrays with the partials of some row blocks, evaluated where they are not stored.
+    """Return the arrays with the partials of some row blocks, evaluated where they are not stored, until this thread asks again.
 
     Parameters
     ----------
@@ -108,7 +109,7 @@ def with_partials(blocks: Blocks, lin: Linearization, spans: Ints) -> Blocks:
         return blocks
     table, at = blocks.table.copy(), 0
     counts = spans[:, 1] - spans[:, 0]
-    values = np.empty(sum(int(n) * c.per_block for n, c in zip(counts, lin.chunks, strict=True)))
+    values = scratch("partials", sum(int(n) * c.per_block for n, c in zip(counts, lin.chunks, strict=True)))
     for k, (c, n) in enumerate(zip(lin.chunks, counts, strict=True)):
         if not n:
             continue

@@ -191,11 +191,13 @@ def analyse(lin: Linearization, rank: Ints, coordinates: Floats, border: Ints | 
     nodes = _Nodes.of(lin, inner)
     points = np.flatnonzero(inner)
     points = points[np.argsort(rank[points], kind="stable")]
-    place = np.full(len(inner), -1)
+    place = np.full(len(inner), -1, dtype=np.int32)
     place[points] = np.arange(len(points))
 
     part = tuple(_point_part(c, inner) for c in lin.chunks)
-    owner = [place[c.parts[j].nodes] if j >= 0 else np.full(len(c.first), -1) for j, c in zip(part, lin.chunks, strict=True)]
+    owner = [
+        place[c.parts[j].nodes] if j >= 0 else np.full(len(c.first), -1, dtype=np.int32) for j, c in zip(part, lin.chunks, strict=True)
+    ]
     first_block, chunk, row = _blocks_by_point(owner, len(points))
     seen = [nodes.of_chunk(c) for c in lin.chunks]  # (N, parts) nodes of each row block
     first_point, members, sparse = clusters_of(first_block, chunk, row, seen, nodes.width)
@@ -213,28 +215,31 @@ def analyse(lin: Linearization, rank: Ints, coordinates: Floats, border: Ints | 
     begin = np.empty(nodes.count, dtype=np.intp)
     begin[elimination] = np.cumsum(nodes.width[elimination]) - nodes.width[elimination]
 
-    members = [m[np.argsort(position[m])] for m in members]
-    home = np.array([front_of[m[0]] if len(m) else -1 for m in members], dtype=np.intp)
+    member, cluster, ends = _flat(members)
+    member = member[np.lexsort((position[member], cluster))]
+    home = np.full(len(members), -1)
+    home[cluster[::-1]] = front_of[member[::-1]]  # of the node that is eliminated first
+    width = nodes.width[member]
+    column = np.concatenate([[0], np.cumsum(width)])  # first column of each member, over all clusters
     front_nodes = _nodes_of_fronts(parts, cliques, position, front_of)
     fronts = _fronts(parts, front_nodes, home, nodes, begin, front_of)
     if kept.any():
         fronts = (*fronts[:-1], replace(fronts[-1], pivots=0))
     rows_in = _RowsInFronts(front_nodes, nodes)
-    widths = [nodes.width[m] for m in members]
-    first_column = np.concatenate([[0], np.cumsum([int(w.sum()) for w in widths])]).astype(np.intp)
+    in_cluster = column[:-1] - column[ends[cluster]]
     return Structure(
-        order=_joined([nodes.columns_of(n) for n in elimination]),
+        order=nodes.unknowns[_ranges(nodes.offset[elimination], nodes.width[elimination])],
         points=points,
         point_columns=lin.unknowns["point"].columns.reshape(-1, 3)[points],
         first_block=first_block,
         block_chunk=chunk,
         block_row=row,
-        starts=_starts(seen, chunk, row, first_block[first_point], members, widths, nodes.count),
+        starts=_starts(seen, chunk, row, first_block[first_point], (member, cluster, in_cluster, ends), nodes.count),
         point_part=part,
         first_point=first_point,
-        first_column=first_column,
-        cluster_columns=_joined([_ranges(begin[m], w) for m, w in zip(members, widths, strict=True)]),
-        cluster_rows=_joined([_ranges(rows_in(f, m), w) for m, w, f in zip(members, widths, home, strict=True)]).astype(np.int32),
+        first_column=column[ends].astype(np.intp),
+        cluster_columns=_ranges(begin[member], width),
+        cluster_rows=_ranges(rows_in(home[cluster], member), width).astype(np.int32),
         sparse=sparse,
         fronts=fronts,
         rest=tuple(_rest(i, rows, seen[i][rows], lin.chunks[i], position, front_of, rows_in) for i, rows in rest),
@@ -302,9 +307,6 @@ class _Nodes:
         out[np.repeat(np.arange(self.count), self.width)[at]] = True
         return out
 
-    def columns_of(self, node: int) -> Ints:
-        return self.unknowns[self.offset[node] : self.offset[node + 1]]
-
     def of_chunk(self, c: Chunk) -> Small:
         """Return the (N, parts) node numbers of row blocks."""
         out = np.full((len(c.first), len(c.parts)), -1, dtype=np.int32)
@@ -326,6 +328,12 @@ class _Nodes:
         return place
 
 
+def _flat(members: list[Ints]) -> tuple[Ints, Ints, Ints]:
+    """Return the members of all clusters one after the other, the cluster of each, and where each cluster begins, and ends."""
+    lengths = [len(m) for m in members]
+    return _joined(members), np.repeat(np.arange(len(members)), lengths), np.concatenate([[0], np.cumsum(lengths)]).astype(np.intp)
+
+
 def _joined(arrays: list[Ints]) -> Ints:
     return np.concatenate([np.zeros(0, dtype=np.intp), *arrays])
 
@@ -343,7 +351,7 @@ def _point_part(c: Chunk, inner: Bools) -> int:
     return ends[0] if len(ends) == 1 and inner[c.parts[ends[0]].nodes].any() else -1
 
 
-def _blocks_by_point(owner: list[Ints], points: int) -> tuple[Ints, Small, Small]:
+def _blocks_by_point(owner: list[Small], points: int) -> tuple[Ints, Small, Small]:
     """Sort the row blocks by their inner point: first block of each point, chunk and row of each block."""
     blocks = [np.flatnonzero(o >= 0).astype(np.int32) for o in owner]
     owners = np.concatenate([o[b] for o, b in zip(owner, blocks, strict=True)])
@@ -352,7 +360,7 @@ def _blocks_by_point(owner: list[Ints], points: int) -> tuple[Ints, Small, Small
     if np.any(np.diff(owners) < 0):
         order = np.argsort(owners, kind="stable")
         owners, chunk, row = owners[order], chunk[order], row[order]
-    return np.searchsorted(owners, np.arange(points + 1)).astype(np.intp), chunk, row
+    return np.concatenate([[0], np.cumsum(np.bincount(owners, minlength=points))]).astype(np.intp), chunk, row
 
 
 def _distinct(sets: Small) -> list[Ints]:
@@ -436,15 +444,19 @@ def _fronts(parts: list[Ints], front_nodes: list[Ints], home: Ints, nodes: _Node
     return tuple(out)
 
 
-def _starts(seen: list[Small], chunk: Small, row: Small, first: Ints, members: list[Ints], widths: list[Ints], count: int) -> Small:
-    """Return for each chunk, one after the other, where the columns of each part begin in the cluster of the block."""
+def _starts(seen: list[Small], chunk: Small, row: Small, first: Ints, members: tuple[Ints, Ints, Ints, Ints], count: int) -> Small:
+    """Return for each chunk, one after the other, where the columns of each part begin in the cluster of the block.
+
+    `members` are nodes, their clusters, where they begin in these, and the first member of each cluster.
+    """
+    node, cluster, begin, ends = members
     sizes = np.cumsum([0, *(numbers.size for numbers in seen)])
     flat = np.full(sizes[-1], -1, dtype=np.int32)
     out = [flat[a:b].reshape(numbers.shape) for a, b, numbers in zip(sizes[:-1], sizes[1:], seen, strict=True)]
     for a, b in slices(first, 256):
         table = np.full((b - a, count + 1), -1, dtype=np.int32)
-        for k in range(a, b):
-            table[k - a, members[k]] = np.cumsum(widths[k]) - widths[k]
+        some = slice(ends[a], ends[b])
+        table[cluster[some] - a, node[some]] = begin[some]
         for i, at, base in stretch(first, a, b, chunk):
             rows = row[at]
             out[i][rows] = table[base[:, None], seen[i][rows]]

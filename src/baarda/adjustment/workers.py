@@ -10,7 +10,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from baarda.distributions.workers import worker_count
+
+KEPT = 4_000_000  # doubles up to which a thread keeps an array
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -55,6 +60,31 @@ def for_each(items: Sequence[S], function: Callable[[S], T], workers: int | None
 def _pool(threads: int) -> ThreadPoolExecutor:
     """One pool for all calls: to begin threads costs more than many a task."""
     return ThreadPoolExecutor(threads)
+
+
+_own = threading.local()
+
+
+def scratch(name: str, size: int) -> NDArray[np.float64]:
+    """Return an array of no certain content that this thread used before under the same name: new memory costs more than to fill it.
+
+    Parameters
+    ----------
+    name : str
+    size : int
+
+    Examples
+    --------
+    >>> len(scratch("example", 5)), scratch("example", 3).base is scratch("example", 4).base
+    (5, True)
+    """
+    if size > KEPT:
+        return np.empty(size)
+    kept: dict[str, NDArray[np.float64]] = _own.__dict__.setdefault("arrays", {})
+    found = kept.get(name)
+    if found is None or len(found) < size:
+        found = kept[name] = np.empty(size)
+    return found[:size]
 
 
 def run_tree(before: Sequence[int], after: Sequence[Sequence[int]], function: Callable[[int], Any], workers: int | None = None) -> None:
