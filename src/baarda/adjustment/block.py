@@ -297,17 +297,36 @@ class BlockSolver:
             z[:, i] /= r[:, i, i, None]
         return z
 
-    def solve_reduced(self, rhs: Floats) -> Floats:
-        """Return S^-1 rhs for (U, k) right-hand sides of the scaled reduced system in the order of elimination."""
-        x = self._down(np.ascontiguousarray(rhs))
+    def solve_reduced(self, rhs: Floats, wanted: Ints | None = None) -> Floats:
+        """Return S^-1 rhs for (U, k) right-hand sides of the scaled reduced system in the order of elimination.
+
+        With `wanted` only these rows of the result need be right, and rows of zeros are made use of.
+        """
+        x = np.ascontiguousarray(rhs)
+        down = up = None
+        if wanted is not None:
+            down, up = self._to_the_root(np.flatnonzero(x.any(axis=1))), self._to_the_root(wanted)
+        x = self._down(x, down)
         if self.border_inverse is not None:
             last = x[len(x) - len(self.border_inverse) :]
             last[:] = self.border_inverse @ last
-        return self._up(x)
+        return self._up(x, up)
 
-    def _down(self, x: Floats) -> Floats:
+    def _to_the_root(self, rows: Ints) -> Ints:
+        """Return the fronts where some rows are eliminated, and all above them, sorted."""
+        fronts = self.structure.fronts
+        found = np.zeros(len(fronts), dtype=bool)
+        begins = np.array([f.begin for f in fronts], dtype=np.intp)
+        found[np.searchsorted(begins, rows, side="right") - 1] = True
+        for f, front in enumerate(fronts):  # children come before their parents
+            if found[f] and front.parent >= 0:
+                found[front.parent] = True
+        return np.flatnonzero(found)
+
+    def _down(self, x: Floats, some: Ints | None = None) -> Floats:
         """Eliminate front by front, in place; what is left for a border stands in its rows."""
-        for front, panel in zip(self.structure.fronts, self.panels, strict=True):
+        for f in range(len(self.panels)) if some is None else some:
+            front, panel = self.structure.fronts[f], self.panels[f]
             p = front.pivots
             if p:
                 own = x[front.begin : front.begin + p]
@@ -315,9 +334,10 @@ class BlockSolver:
                 x[front.columns[p:]] -= panel[p:] @ own
         return x
 
-    def _up(self, x: Floats) -> Floats:
+    def _up(self, x: Floats, some: Ints | None = None) -> Floats:
         """Substitute backwards, in place."""
-        for front, panel in zip(reversed(self.structure.fronts), reversed(self.panels), strict=True):
+        for f in reversed(range(len(self.panels)) if some is None else some):
+            front, panel = self.structure.fronts[f], self.panels[f]
             p = front.pivots
             if p:
                 own = x[front.begin : front.begin + p]
@@ -369,9 +389,12 @@ class BlockSolver:
         where = point[columns].max(axis=1, initial=-1)
         out = np.zeros((*columns.shape, columns.shape[1]))
         inner = np.flatnonzero(where >= 0)
-        at, free = axis[columns[inner]], columns[inner] >= 0
-        found = points[where[inner][:, None, None], at[:, :, None], at[:, None, :]]
-        out[inner] = np.where(free[:, :, None] & free[:, None, :], found, 0.0)
+        if np.array_equal(columns[inner], own[where[inner]]):  # whole points: zero where a coordinate is fixed
+            out[inner] = points[where[inner]]
+        else:
+            at, free = axis[columns[inner]], columns[inner] >= 0
+            found = points[where[inner][:, None, None], at[:, :, None], at[:, None, :]]
+            out[inner] = np.where(free[:, :, None] & free[:, None, :], found, 0.0)
         outer = np.flatnonzero(where < 0)
         out[outer] = nodes(columns[outer])
         return out

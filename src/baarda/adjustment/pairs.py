@@ -51,9 +51,9 @@ def pairs(solver: BlockSolver, a: Ints, b: Ints) -> Floats:
 
     (left, own_a), (right, own_b) = chosen(a), chosen(b)
     out = np.asarray((own_a.T @ own @ own_b).toarray())
-    step = max(1, AT_ONCE // max(count, 1))
+    step, wanted = max(1, AT_ONCE // max(count, 1)), np.unique(left.nonzero()[0])
     for k in range(0, len(b), step):
-        out[:, k : k + step] += left.T @ solver.solve_reduced(right[:, k : k + step].toarray())
+        out[:, k : k + step] += left.T @ solver.solve_reduced(right[:, k : k + step].toarray(), wanted)
     return out
 
 

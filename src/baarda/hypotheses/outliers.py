@@ -127,6 +127,8 @@ def standardised(
     seen = q > 0.0
     if redundancy_numbers is not None:
         seen &= np.asarray(redundancy_numbers, dtype=float) >= UNCONTROLLED
+    if seen.all():
+        return np.asarray(v / (sigma0 * np.sqrt(q)))
     w = np.full(v.shape, np.nan)
     np.divide(v, sigma0 * np.sqrt(np.where(seen, q, 1.0)), out=w, where=seen)
     return w
