@@ -74,7 +74,11 @@ def statistics(result: Any, afresh: bool = False) -> Any:
             lin = linearize(network, state, result.numbering, Arrangement.of(result.groups, rank, network))
             structure = analyse(lin, rank, state.points)
         solver = BlockSolver.of(lin, structure, result.datum.held)
-    found = replace(result, lin=lin, solver=solver)
+    return numbers(replace(result, lin=lin, solver=solver))
+
+
+def numbers(found: Any) -> Any:
+    """Compute all statistics with the factor of an adjustment."""
     r, v, qvv = found.redundancy_numbers, found.residuals, found.qvv
     for name in ("image_cofactors", "point_cofactors", "camera_estimates"):
         getattr(found, name)
@@ -488,7 +492,7 @@ def child(program: str, what: str, size: int) -> None:
     else:
         result = adjust(network)
         if what == "statistics":
-            statistics(result)
+            numbers(result)
     after = peak(reset)
     print(json.dumps({"megabytes": (after - before) / 1e6, "input": before / 1e6}))
 

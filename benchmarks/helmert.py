@@ -84,11 +84,11 @@ def plain(project: Path, out: Path, limit: float) -> dict[str, float]:
     a = adjust(read(project), solver="block", jobs=1)
     adjusted = time.perf_counter()
     tested = Analysis(a, Options(), ())
-    share, found = a.controlled_share, a._statistics
+    share = a.controlled_share
     columns = {
         "w": tested.w,
         "tau": tested.tau,
-        "mdb": mdb(share / found["pqvvp"], share),
+        "mdb": mdb(share / a.pqvvp, share),
         "external": external_reliability(np.minimum(share, 1.0)),
         "p_value": 2.0 * TauLaw(a.redundancy).sf(np.abs(tested.tau)),
     }
@@ -117,7 +117,9 @@ def compared(a: Path, b: Path) -> str:
     if x.keys() != y.keys():
         return "DIFFERENT UNKNOWNS"
     p, q = (np.array([t[k] for k in x]) for t in (x, y))
-    return f"unknowns {np.abs((p - q)[:, 0] / p[:, 1]).max():.1e} sigma, sigmas {np.abs((p - q)[:, 1] / p[:, 1]).max():.1e} relative"
+    apart, sigmas = np.abs(p - q)[:, 0], np.abs((p - q)[:, 1] / p[:, 1]).max()
+    relative = (apart / np.maximum(np.abs(p[:, 0]), p[:, 1])).max()  # values around zero have the size of their sigma
+    return f"unknowns {(apart / p[:, 1]).max():.1e} sigma, {relative:.1e} relative; sigmas {sigmas:.1e} relative"
 
 
 def bytes_of(limit: str) -> float:

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from baarda.adjustment import estimates, tables
 from baarda.adjustment.covariance import Cofactors
 from baarda.adjustment.datum import Datum
-from baarda.adjustment.linear_system import Chunk, Linearization
+from baarda.adjustment.linear_system import Linearization
 from baarda.adjustment.linearize import offsets_of
 from baarda.adjustment.solver import Solver
 from baarda.errors import UsageError
@@ -153,38 +153,26 @@ class Adjustment:
 
     @cached_property
     def _statistics(self) -> dict[str, Floats]:
-        """Diagonals of Qvv, Qvv P and P Qvv P, and P v, from the blocks I - H of whitened residuals."""
-        out = {name: np.empty(self.count) for name in ("qvv", "redundancy", "pqvvp", "pv", "weight")}
+        """Diagonals of Qvv and Qvv P, from the blocks I - H of whitened residuals."""
+        return self._diagonals(("qvv", "redundancy"))
+
+    @cached_property
+    def _weighted(self) -> dict[str, Floats]:
+        """Diagonals of P Qvv P and P, and P v."""
+        return self._diagonals(("pqvvp", "pv", "weight"))
+
+    def _diagonals(self, names: tuple[str, ...]) -> dict[str, Floats]:
+        out = {name: np.empty(self.count) for name in names}
         with threadpool_limits(limits=1, user_api="blas"):
             hats = self.solver.hat()
         for c, hat in zip(self.lin.chunks, hats, strict=True):
-            plain = not c.correlated and c.controlled is None
+            diagonal = _plain if not c.correlated and c.controlled is None else _full
             for some in c.pieces():
-                self._put(out, c, some, hat[some], plain)
+                controlled = None if c.controlled is None else c.controlled[some]
+                rows, found = c.rows_of(some), diagonal(names, c.factor[some], hat[some], c.misclosure[some], controlled)
+                for name, values in found.items():
+                    out[name][rows] = values
         return out
-
-    @staticmethod
-    def _put(out: dict[str, Floats], c: Chunk, some: slice, hat: Floats, plain: bool) -> None:
-        """Store the diagonals of some row blocks of a chunk; `plain`: uncorrelated, and controlled by the observation equations alone."""
-        factor, misclosure, rows = c.factor[some], c.misclosure[some], c.rows_of(some)
-        if plain:
-            sigma = np.einsum("nii->ni", factor)
-            share = 1.0 - np.einsum("nii->ni", hat)
-            found = (share * sigma**2, share, share / sigma**2, -misclosure / sigma, 1.0 / sigma**2)
-        else:
-            rest = (np.eye(hat.shape[1]) if c.controlled is None else c.controlled[some]) - hat
-            inverse = np.linalg.inv(factor)
-            left = factor @ rest
-            weighted = inverse.transpose(0, 2, 1)
-            found = (
-                np.einsum("nij,nij->ni", left, factor),
-                np.einsum("nij,nji->ni", left, inverse),
-                np.einsum("nij,nji->ni", weighted @ rest, inverse),
-                -(weighted @ misclosure[:, :, None])[:, :, 0],
-                np.einsum("nij,nji->ni", weighted, inverse),
-            )
-        for name, values in zip(("qvv", "redundancy", "pqvvp", "pv", "weight"), found, strict=True):
-            out[name][rows] = values
 
     @property
     def redundancy_numbers(self) -> Floats:
@@ -197,12 +185,22 @@ class Adjustment:
 
         The redundancy number of uncorrelated observations, and what stands for it in w, mdb and external reliability of correlated ones.
         """
-        return np.asarray(self._statistics["pqvvp"] / self._statistics["weight"])
+        return np.asarray(self._weighted["pqvvp"] / self._weighted["weight"])
 
     @property
     def qvv(self) -> Floats:
         """Diagonal of the cofactor matrix of the residuals."""
         return self._statistics["qvv"]
+
+    @property
+    def pv(self) -> Floats:
+        """P v."""
+        return self._weighted["pv"]
+
+    @property
+    def pqvvp(self) -> Floats:
+        """Diagonal of P Qvv P."""
+        return self._weighted["pqvvp"]
 
     def residuals_of(self, errors: Floats) -> Floats:
         """Map standardised errors (n, k), whitened and independent, to standardised residuals -Qvv P e, each divided by its sigma."""
@@ -357,8 +355,8 @@ class Adjustment:
             unknowns=self.numbering.count,
             qvv=self.qvv,
             redundancy_numbers=self.redundancy_numbers,
-            pv=self._statistics["pv"],
-            pqvvp=self._statistics["pqvvp"],
+            pv=self.pv,
+            pqvvp=self.pqvvp,
             groups=codes["group"],
             images=np.where(image_rows, codes["image"], -1),
             points=codes["point"],
@@ -437,3 +435,28 @@ class Adjustment:
     def with_assumptions(self, *more: str) -> Adjustment:
         """Return the result with further assumptions for the report."""
         return replace(self, assumptions=(*self.assumptions, *more))
+
+
+def _plain(names: tuple[str, ...], factor: Floats, hat: Floats, misclosure: Floats, controlled: Floats | None) -> dict[str, Floats]:
+    """Return the diagonals (n, m) of `Adjustment._diagonals` of uncorrelated row blocks that their conditions control in full."""
+    sigma = np.einsum("nii->ni", factor)
+    if "weight" in names:
+        weight = 1.0 / sigma**2
+        return {"pqvvp": (1.0 - np.einsum("nii->ni", hat)) * weight, "pv": -misclosure / sigma, "weight": weight}
+    share = 1.0 - np.einsum("nii->ni", hat)
+    return {"qvv": share * sigma**2, "redundancy": share}
+
+
+def _full(names: tuple[str, ...], factor: Floats, hat: Floats, misclosure: Floats, controlled: Floats | None) -> dict[str, Floats]:
+    """As `_plain` for correlated row blocks, and for conditions that control only a part of their observations."""
+    rest = (np.eye(hat.shape[1]) if controlled is None else controlled) - hat
+    inverse = np.linalg.inv(factor)
+    if "weight" in names:
+        weighted = inverse.transpose(0, 2, 1)
+        return {
+            "pqvvp": np.einsum("nij,nji->ni", weighted @ rest, inverse),
+            "pv": -(weighted @ misclosure[:, :, None])[:, :, 0],
+            "weight": np.einsum("nij,nji->ni", weighted, inverse),
+        }
+    left = factor @ rest
+    return {"qvv": np.einsum("nij,nij->ni", left, factor), "redundancy": np.einsum("nij,nji->ni", left, inverse)}

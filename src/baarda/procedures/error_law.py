@@ -166,7 +166,7 @@ def critical_values(
         ]
     elif shapes:
         raise UsageError("shapes are given by the law itself")
-    pqvvp = adjustment._statistics["pqvvp"]
+    pqvvp = adjustment.pqvvp
     with threadpool_limits(limits=1, user_api="blas"):
         return simulate_critical_values(
             statistics_of(adjustment),
@@ -184,7 +184,7 @@ def critical_values(
 
 def statistics_of(adjustment: Adjustment) -> StatisticsOf:
     """Return the map from whitened errors (n, k) to w (n, k) and v'Pv (k,)."""
-    pqvvp = adjustment._statistics["pqvvp"]
+    pqvvp = adjustment.pqvvp
     # Uncontrolled observations have no w; rounding may leave their cofactor a little below zero.
     root = np.sqrt(np.where(adjustment.controlled_share >= UNCONTROLLED, pqvvp, np.nan))[:, None]
     correlated = [c for c in adjustment.lin.chunks if c.factor.shape[1] > 1 and np.any(np.tril(c.factor, -1))]

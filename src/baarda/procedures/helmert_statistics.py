@@ -296,8 +296,7 @@ def observation_table(a: PartAdjustment, options: Options) -> Table:
     table = a.observations
     if not a.whole.converged:
         return Table({**table.columns, "status": np.full(len(table), "used", dtype=object)}, table.units)
-    found = a._statistics
-    pv, pqvvp, share = found["pv"], found["pqvvp"], a.controlled_share
+    pv, pqvvp, share = a.pv, a.pqvvp, a.controlled_share
     w = standardised(pv, pqvvp, 1.0, share)
     tau = standardised(pv, pqvvp, a.sigma0, share)
     judged, law = (tau, TauLaw(a.redundancy)) if options.sigma == "aposteriori" else (w, stats.norm())

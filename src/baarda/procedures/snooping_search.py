@@ -304,12 +304,12 @@ class Search:
         own = float(column[row])
         share = float(a.controlled_share[row])
         with np.errstate(divide="ignore", invalid="ignore"):
-            rho = column / np.sqrt(own * a._statistics["pqvvp"])
+            rho = column / np.sqrt(own * a.pqvvp)
         rho[rows] = 0.0
         rho[a.controlled_share < UNCONTROLLED] = 0.0
         other = int(np.argmax(np.abs(rho)))
         correlation = float(np.clip(rho[other], -1.0, 1.0))
-        error = -float(a._statistics["pv"][row]) / own
+        error = -float(a.pv[row]) / own
         aposteriori = self.o.sigma == "aposteriori"
         known = delta0(self.o.alpha_outlier, self.o.power)
         name = (
