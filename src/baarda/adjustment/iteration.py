@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 REUSE = 1e-4  # relative step below which the factor of the last iteration serves the next ones
-SCALED = 0.1  # relative step from which the columns are scaled anew
+SCALED = 0.1  # relative full step from which the columns are scaled anew
 NEAR = 1e-3  # relative step below which a full step is not tried before it is taken
 BEND = 1e-7  # relative step above which steps are bent
 
@@ -198,7 +198,7 @@ def iterate(
         if not near:
             scale = lin.scale
             del lin
-            lin = linearized(state, scale if relative < SCALED else None)
+            lin = linearized(state, scale if full and relative < SCALED else None)
         if control.settled(relative, plain) and (full or _full_step(lin, tied, factor) <= 1e-6):
             return state, lin, control.history, True
         control.relax(relative)
