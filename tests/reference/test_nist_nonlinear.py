@@ -11,10 +11,10 @@ from baarda.errors import Singular
 from baarda.network import Declared, Images, Network, Points
 from baarda.observations.base import Block, Rows
 
-# Starts from which the adjustment does not arrive. At MGH09's first start the curve hardly depends on the sizes of its parameters: b1 and
-# b2 grow against each other in a flat valley that falls to 9.4E-04, three times the certified sum; at MGH17's first start the exponentials
-# have died away at the second abscissa already, so that columns of the design matrix differ by rounding alone (condition 4e13).
-ASTRAY = {("MGH09", 1): ("b1", "b2"), ("MGH17", 1): ("b2", "b3")}
+# The start from which the adjustment does not arrive: at MGH17's first one the exponentials have died away at the second abscissa already,
+# so that columns of the design matrix differ by rounding alone (condition 4e13) and the system is refused before a step is taken. (A
+# trust region that steps all the same, MINPACK's, arrives after 500 evaluations.)
+ASTRAY = {("MGH17", 1): ("b2", "b3")}
 MISPRINTED = {("Roszman1", 0): 0.20196866396}  # the file says 1.20196866396E-0, a sum of squares of 25 instead of the certified 4.9E-04
 
 
@@ -163,4 +163,4 @@ def test_certified_values_fit_their_sums_of_squares(folder):
         _, values, _, rss, deviation, freedoms, data = problem(folder, name)
         assert float(((data[:, 0] - model(values, data[:, 1])) ** 2).sum()) == pytest.approx(rss, rel=1e-6), name
         assert np.sqrt(rss / freedoms) == pytest.approx(deviation, rel=1e-9), name
-    assert sum((name, start) not in ASTRAY for name in MODELS for start in (1, 2)) == 24
+    assert sum((name, start) not in ASTRAY for name in MODELS for start in (1, 2)) == 25

@@ -14,6 +14,7 @@ from baarda.adjustment.linear_system import Linearization
 from baarda.adjustment.linearize import Arrangement, linearize, whitened_misclosures
 from baarda.adjustment.result import Iteration
 from baarda.adjustment.solver import Solver
+from baarda.errors import Singular
 from baarda.network import Network, State
 from baarda.observations import ImagePoints, Kind
 
@@ -100,6 +101,14 @@ class Control:
         rounding = relative < 1e-9 and relative >= 0.5 * self._last  # only that is left
         return left <= self.tolerance or self._stalled == 2 or rounding
 
+    def stiffen(self) -> bool:
+        """Damp where a system cannot be solved; return False at the start, and where damping does not help."""
+        if len(self.history) == 1 or self.damping > 1.0:
+            return False
+        self.damping = max(self.damping * self._growth, 1e-4)
+        self._growth, self._last = 2.0 * self._growth, np.inf
+        return True
+
     def relax(self, relative: float) -> None:
         """Damp less after an accepted step."""
         self.damping *= max(0.5 if self._curved else 0.2, 1.0 - (2.0 * min(self._gain, 1.0) - 1.0) ** 3)
@@ -141,17 +150,23 @@ def iterate(
 
     Steps that shrink at a constant rate, as large residuals make them, are extrapolated; others are bent by the second derivative along
     them, solved with the same factor (geodesic acceleration: Transtrum & Sethna 2012), so that narrow curved valleys of weak
-    self-calibrations are followed, not crept along.
+    self-calibrations are followed, not crept along. Damping counts in the largest scale that a column has had (More 1978), so that what
+    hardly matters for a while does not run away; a system that cannot be solved on the way is damped.
     """
     control = Control(float(lin.misclosure @ lin.misclosure), lin.count, settings, settings.progress)
     before: Floats | None = None  # the last full step, as a change of the observations
-    centres = centres_of_rays(groups.groups, state)
+    centres, largest = centres_of_rays(groups.groups, state), lin.scale
 
     def moved(step: Floats) -> State:
         return state.moved(unknowns, step, centres)
 
     def linearized(there: State, scale: Floats | None) -> Linearization:
         return replace(linearize(network, there, unknowns, groups, workers), near=scale)
+
+    def stiffened() -> Linearization:
+        nonlocal largest
+        largest = np.maximum(largest, lin.scale)
+        return replace(lin, near=largest)
 
     def misclosures(step: Floats) -> tuple[State, Floats, float]:
         trial = moved(step)
@@ -167,7 +182,13 @@ def iterate(
         if solver is not None and control.reuses:
             solver = solver.at(lin)  # the system hardly differs from the one that was factored
         else:
-            solver = factor(lin, datum, control.damping)
+            try:
+                solver = factor(stiffened() if control.damping > 0.0 else lin, datum, control.damping)
+            except Singular:
+                if not control.stiffen():
+                    raise
+                before = solver = None
+                continue
         step, change = _step(lin, solver, datum, lin.misclosure)
         squares = float(change @ change)
         relative, lengthened, plain = control.relative(squares), 1.0, before is not None
