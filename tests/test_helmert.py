@@ -311,7 +311,7 @@ def test_files_that_changed_are_refused(tmp_path):
 def test_too_little_memory_is_told_with_the_figure(tmp_path, monkeypatch):
     source = write_partition(aerial(12), 2, tmp_path / "p")
     monkeypatch.setattr(helmert_stand, "memory_limit", lambda: 3e5)
-    with open_engine() as e, pytest.raises(NotEnoughMemory, match=r"part 0 need.* GB of memory; the worker may take 0\.0003 GB"):
+    with open_engine() as e, pytest.raises(NotEnoughMemory, match=r"part 0 would take .* GB of memory; the worker may take 0\.0003 GB"):
         solve_blocked(source, e)
 
 
@@ -334,7 +334,7 @@ def test_what_does_not_fit_in_one_piece_fits_in_parts(tmp_path, monkeypatch):
     limit = 1.2 * needed
     for module in (memory, helmert_stand.memory):
         monkeypatch.setattr(module, "available", lambda: limit)
-    with pytest.raises(NotEnoughMemory, match="need"):
+    with pytest.raises(NotEnoughMemory, match="would take"):
         baarda.adjust(network, solver="block")
     with open_engine() as e:
         blocked = solve_blocked(source, e, tell=told.append)

@@ -20,7 +20,7 @@ from baarda.adjustment.dense import refuse_null_space
 from baarda.adjustment.kernels import Kernels, kernels
 from baarda.adjustment.linear_system import Linearization
 from baarda.adjustment.pairs import pairs
-from baarda.adjustment.row_blocks import Blocks, blocks_of, scaled_rows, sizes, with_partials
+from baarda.adjustment.row_blocks import Blocks, blocks_of, scaled_rows, sizes, table_of, with_partials
 from baarda.adjustment.selected_inverse import NodeBlocks, selected_inverse
 from baarda.adjustment.structure import Front, Run, Structure
 from baarda.adjustment.workers import for_each, run_tree
@@ -130,8 +130,11 @@ class BlockSolver:
 
     def at(self, lin: Linearization | None) -> BlockSolver:
         """Return this factor for the system at a state nearby, as an approximate one; None only lets the old system go."""
-        values = np.zeros(0) if lin is None else lin.values  # no view: it would keep the old ones
-        return replace(self, lin=cast(Linearization, lin), blocks_=self.blocks_._replace(values=values), rhs=None)
+        if lin is None:  # no view of the old values may stay
+            arrays = self.blocks_._replace(values=np.zeros(0))
+        else:
+            arrays = self.blocks_._replace(values=lin.values, table=table_of(lin, self.structure))
+        return replace(self, lin=cast(Linearization, lin), blocks_=arrays, rhs=None)
 
     @property
     def count(self) -> int:

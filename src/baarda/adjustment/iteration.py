@@ -98,7 +98,7 @@ class Control:
         self._stalled = self._stalled + 1 if relative <= 1e-7 and relative >= 0.8 * self._last else 0
         rate = 10.0 * relative / self._last if plain else 1.0
         left = relative * min(rate, 1.0)  # the next step by the rate of the last two, with caution
-        rounding = relative < 1e-9 and relative >= 0.5 * self._last  # only that is left
+        rounding = relative < 1e-9 and relative >= 0.9 * self._last  # only that is left
         return left <= self.tolerance or self._stalled == 2 or rounding
 
     def stiffen(self) -> bool:
@@ -155,6 +155,7 @@ def iterate(
     """
     control = Control(float(lin.misclosure @ lin.misclosure), lin.count, settings, settings.progress)
     before: Floats | None = None  # the last full step, as a change of the observations
+    straight = False  # whether the last step was neither damped nor bent nor lengthened
     centres, largest = centres_of_rays(groups.groups, state), lin.scale
 
     def moved(step: Floats) -> State:
@@ -187,17 +188,17 @@ def iterate(
             except Singular:
                 if not control.stiffen():
                     raise
-                before = solver = None
+                before, solver, straight = None, None, False
                 continue
         step, change = _step(lin, solver, datum, lin.misclosure)
-        squares = float(change @ change)
-        relative, lengthened, plain = control.relative(squares), 1.0, before is not None
+        squares, bent = float(change @ change), False
+        relative, lengthened, plain = control.relative(squares), 1.0, straight
         if control.damping == 0.0 and before is not None and relative < 0.01:
             lengthened = extrapolation(float(change @ before), float(before @ before), squares)
-            step, plain = lengthened * step, lengthened == 1.0
+            step, plain = lengthened * step, straight and lengthened == 1.0
         predicted = 2.0 * lengthened * float(change @ lin.misclosure) - lengthened**2 * squares
         if lengthened == 1.0 and control.bends(relative):
-            step, plain = _bent(lin, solver, datum, step, change, lambda x: misclosures(x)[1]), False
+            step, plain, bent = _bent(lin, solver, datum, step, change, lambda x: misclosures(x)[1]), False, True
         near = control.near(relative)
         if near:  # linearised at once
             trial, solver, scale = moved(step), solver.at(None), lin.scale
@@ -209,21 +210,21 @@ def iterate(
             trial, _, value = misclosures(step)
         full = control.damping == 0.0
         if not control.takes(value, predicted, relative):
-            before = solver = None
+            before, solver, straight = None, None, False
             if near:
                 lin = linearized(state, scale)
             continue
         state = trial
-        before = change if full and lengthened == 1.0 else None
+        before, straight = change if full and lengthened == 1.0 else None, full and lengthened == 1.0 and not bent
         solver = solver.at(None) if full and relative <= REUSE else None
         if not near:
             scale = lin.scale
             del lin
             lin = linearized(state, scale if full and relative < SCALED else None)
         if control.settled(relative, plain) and (full or _full_step(lin, tied, factor) <= 1e-6):
-            return state, lin, control.history, True
+            return state, replace(lin, near=None), control.history, True
         control.relax(relative)
-    return state, lin, control.history, False
+    return state, replace(lin, near=None), control.history, False
 
 
 def _step(lin: Linearization, solver: Solver, datum: Datum, y: Floats) -> tuple[Floats, Floats]:

@@ -16,7 +16,7 @@ from baarda.adjustment.workers import for_each, scratch
 from baarda.errors import InputError, UsageError
 from baarda.network import Network, State, UnknownGroup, Unknowns
 from baarda.observations import Kind, Rows
-from baarda.observations.image_points import Evaluation
+from baarda.observations.image_points import CHUNK, Evaluation, Piece
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -24,7 +24,7 @@ Ints = NDArray[np.intp]
 
 EVALUATED_FROM = 100_000  # rows of a group whose partials are evaluated wherever they are needed, not stored
 MANY_OPTICS = 16  # more than these are stored
-FEW_BESIDE = 10_000  # scalar rows of other groups with points: their partials are copied where those of a group are evaluated
+FEW_BESIDE = 10_000  # scalar rows of other kinds with points: their partials are copied where those of image points are evaluated
 
 
 @dataclass(frozen=True)
@@ -109,26 +109,23 @@ def linearize(
     arranged = groups if isinstance(groups, Arrangement) else Arrangement.of(groups)
     kept = kept_positions(unknowns)
     fillings: list[_Filling | Chunk] = []
-    large = _large(arranged, network)
+    large = evaluated_groups(arranged.sorted, network, unknowns) if arranged.ranked else set()
     group: Any
     for g, group in enumerate(arranged.sorted):
         first = arranged.first[g]
-        evaluated = _evaluated(group, first, network, state, unknowns, kept, workers) if g in large else None
-        if evaluated is not None:
-            fillings += evaluated
+        if g in large:  # a chunk for each optics, however its partials are had
+            for optics, rows in group.by_optics(network):
+                chunk = _evaluated(group, optics, rows, first, network, state, unknowns, kept, workers)
+                pieces = [Piece(optics, rows[a : a + CHUNK]) for a in range(0, len(rows), CHUNK)]
+                fillings.append(chunk or _planned(group, pieces, first, network, state, unknowns, kept))
         elif hasattr(group, "pieces"):
             by_width: dict[int, list[Any]] = {}
             for piece in group.pieces(network):
                 by_width.setdefault(piece.width, []).append(piece)
-            for pieces in by_width.values():
-                rows = group.linearize_piece(network, state, pieces[0])
-                evaluate, fill = (partial(f, network, state) for f in (group.linearize_piece, group.fill))
-                later = [_Later(len(p.rows), group.images_of(network, p), partial(evaluate, p), partial(fill, p)) for p in pieces[1:]]
-                where = np.concatenate([first[p.rows] for p in pieces])
-                fillings.append(_Filling.of(rows, later, where, unknowns, kept, group.name))
+            fillings += [_planned(group, pieces, first, network, state, unknowns, kept) for pieces in by_width.values()]
         else:
-            for rows in group.linearize(network, state):
-                fillings.append(_Filling.of(rows, [], first[rows.index], unknowns, kept, group.name))
+            for found in group.linearize(network, state):
+                fillings.append(_Filling.of(found, [], first[found.index], unknowns, kept, group.name))
     values = np.empty(sum(f.size for f in fillings if isinstance(f, _Filling)))
     start = 0
     chunks = []
@@ -147,55 +144,51 @@ def _sorted(keys: Ints, count: int) -> Ints:
     return np.asarray(sparse.csr_array((ones, (keys, np.arange(n))), shape=(count, n)).indices, dtype=np.intp)
 
 
-def is_evaluated(group: Any, network: Network) -> bool:
-    """Return whether the partials of a group, if it is sorted by points, are evaluated wherever they are needed instead of being stored.
+def evaluated_groups(groups: Sequence[Kind], network: Network, unknowns: Unknowns) -> set[int]:
+    """Return the numbers of the groups whose partials, if they are sorted by points, are not stored but evaluated wherever they are needed.
 
     Parameters
     ----------
-    group : Kind
+    groups : sequence of Kind
     network : Network
+    unknowns : Unknowns
     """
-    if not hasattr(group, "pieces") or len(group) < EVALUATED_FROM or np.any(group.correlations):
-        return False
-    stretches = group.by_optics(network)
-    return len(stretches) <= MANY_OPTICS and all(group.can_be_evaluated(optics) for optics, _ in stretches)
-
-
-def _large(arranged: Arrangement, network: Network) -> set[int]:
-    """Return the sorted groups whose partials are not to be stored."""
-    if not arranged.ranked:
+    if len(kept_positions(unknowns).get(("point", 3), ())) != 3:
         return set()
-    groups: list[Any] = list(arranged.sorted)
-    large = {g for g, group in enumerate(groups) if is_evaluated(group, network)}
-    others = [group for g, group in enumerate(groups) if g not in large and getattr(group, "kind", "point") == "point"]
-    beside = sum(len(group) * len(group.components) for group in others)
-    return large if beside <= FEW_BESIDE else set()
+    every: list[Any] = list(groups)
+    others = [g for g in every if not hasattr(g, "pieces") and getattr(g, "kind", "point") == "point"]
+    if sum(len(g) * len(g.components) for g in others) > FEW_BESIDE:
+        return set()
+    return {i for i, g in enumerate(every) if hasattr(g, "pieces") and len(g) >= EVALUATED_FROM and _can_be_evaluated(g, network)}
+
+
+def _can_be_evaluated(group: Any, network: Network) -> bool:
+    stretches = group.by_optics(network)
+    uncorrelated = not np.any(group.correlations)
+    return uncorrelated and len(stretches) <= MANY_OPTICS and all(group.can_be_evaluated(optics) for optics, _ in stretches)
 
 
 def _evaluated(
-    group: Any, first: Ints, network: Network, state: State, unknowns: Unknowns, kept: Any, workers: int | None
-) -> list[Chunk] | None:
-    """Return a chunk for each optics whose partials are evaluated wherever they are needed; None where that cannot be done."""
-    chunks = []
-    for optics, rows in group.by_optics(network):
-        some, evaluation = slice(int(rows[0]), int(rows[-1]) + 1), group.evaluation(optics, network, state)
-        count = some.stop - some.start
-        width = {"camera": len(optics.model.order), "image": 6, "point": 3}
-        positions = [kept.get(key, np.zeros(0, dtype=np.intp)) for key in width.items()]
-        if evaluation is None or len(positions[2]) != 3 or count != len(rows):
-            return None
-        misclosure = np.empty((count, 2))
-        rays = Rays(evaluation, some.start, count, tuple(positions))
-        pieces = [slice(a, min(a + PIECE, count)) for a in range(0, count, PIECE)]
-        if not all(for_each(pieces, partial(rays.misclosures, misclosure), workers)):
-            return None
-        nodes = (network.images.cameras[group.images[some]], group.images[some], group.points[some])
-        parts = tuple(
-            Part(unknowns[kind], own, at, np.zeros((0, 2, len(at))), -1) for kind, own, at in zip(width, nodes, positions, strict=True)
-        )
-        factor = np.broadcast_to(_diagonal(np.asarray(group.sigmas[some])), (count, 2, 2))
-        chunks.append(Chunk(first[some], misclosure, parts, factor, None, rays))
-    return chunks
+    group: Any, optics: Any, rows: Ints, first: Ints, network: Network, state: State, unknowns: Unknowns, kept: Any, workers: int | None
+) -> Chunk | None:
+    """Return a chunk whose partials are evaluated wherever they are needed; None where a distortion is not inverted by the loop."""
+    some, evaluation = slice(int(rows[0]), int(rows[-1]) + 1), group.evaluation(optics, network, state)
+    count = some.stop - some.start
+    if evaluation is None or count != len(rows):
+        return None
+    width = {"camera": len(optics.model.order), "image": 6, "point": 3}
+    positions = [kept.get(key, np.zeros(0, dtype=np.intp)) for key in width.items()]
+    misclosure = np.empty((count, 2))
+    rays = Rays(evaluation, some.start, count, tuple(positions))
+    pieces = [slice(a, min(a + PIECE, count)) for a in range(0, count, PIECE)]
+    if not all(for_each(pieces, partial(rays.misclosures, misclosure), workers)):
+        return None
+    nodes = (network.images.cameras[group.images[some]], group.images[some], group.points[some])
+    parts = tuple(
+        Part(unknowns[kind], own, at, np.zeros((0, 2, len(at))), -1) for kind, own, at in zip(width, nodes, positions, strict=True)
+    )
+    factor = np.broadcast_to(_diagonal(np.asarray(group.sigmas[some])), (count, 2, 2))
+    return Chunk(first[some], misclosure, parts, factor, None, rays)
 
 
 @dataclass(frozen=True)
@@ -220,6 +213,18 @@ class Rays:
             n, at = len(rows), self.begin + rows
         if not self.evaluation(at, self.positions, scratch("misclosures", 2 * n).reshape(n, 2), split(values, n, 2, self.positions)):
             raise UsageError(f"{self.evaluation.group.name}: a distortion cannot be inverted")
+
+
+def _planned(group: Any, pieces: list[Any], first: Ints, network: Network, state: State, unknowns: Unknowns, kept: Any) -> _Filling:
+    """Linearise the first of some pieces, and plan a chunk of them all."""
+    evaluate, fill = (partial(f, network, state) for f in (group.linearize_piece, group.fill))
+    try:
+        rows = evaluate(pieces[0])
+    except Exception as error:
+        error.add_note(f"{group.name}: {group.images_of(network, pieces[0])}")
+        raise
+    later = [_Later(len(p.rows), group.images_of(network, p), partial(evaluate, p), partial(fill, p)) for p in pieces[1:]]
+    return _Filling.of(rows, later, np.concatenate([first[p.rows] for p in pieces]), unknowns, kept, group.name)
 
 
 def kept_positions(unknowns: Unknowns) -> dict[tuple[str, int], Ints]:
@@ -338,7 +343,11 @@ def whitened_misclosures(network: Network, state: State, groups: Sequence[Kind] 
         if hasattr(group, "pieces"):
 
             def work(piece: Any, group: Any = group, first: Ints = first, m: int = m) -> None:
-                white = _white(group.misclosures_of_piece(network, state, piece), group, piece.rows)
+                try:
+                    white = _white(group.misclosures_of_piece(network, state, piece), group, piece.rows)
+                except Exception as error:
+                    error.add_note(f"{group.name}: {group.images_of(network, piece)}")
+                    raise
                 for r in range(m):
                     out[first[piece.rows] + r] = white[:, r]
 

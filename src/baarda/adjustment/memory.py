@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from baarda.adjustment.linearize import is_evaluated
+from baarda.adjustment.linearize import evaluated_groups
 from baarda.adjustment.structure import Structure
 from baarda.errors import NotEnoughMemory
 from baarda.executors import memory_limit
@@ -64,7 +64,8 @@ def of_rows(unknowns: Unknowns, groups: Sequence[Kind], network: Network) -> flo
     free = [(camera.columns[a:b] >= 0).sum() for a, b in zip(camera.offsets[:-1], camera.offsets[1:], strict=True)]
     width = 9 + (int(max(free)) if len(widths) else 0)
     scalars = [len(g) * len(g.components) for g in groups]
-    stored = sum(n for n, g in zip(scalars, groups, strict=True) if not is_evaluated(g, network))
+    evaluated = evaluated_groups(groups, network, unknowns)
+    stored = sum(n for g, n in enumerate(scalars) if g not in evaluated)
     return float(DOUBLE * (sum(scalars) * 12 + stored * width) + DOUBLE * unknowns.count * 12)
 
 
@@ -96,10 +97,10 @@ def check(needed: float, what: str, tell: Callable[[str], None] | None) -> None:
     >>> check(1e18, "the factor", None)  # doctest: +ELLIPSIS
     Traceback (most recent call last):
     ...
-    baarda.errors.NotEnoughMemory: the factor need(s) about 1000000000.0 GB of memory; ... GB are available
+    baarda.errors.NotEnoughMemory: the factor would take about 1000000000.0 GB of memory; ... GB are available
     """
     there = available()
     if needed > there:
-        raise NotEnoughMemory(f"{what} need(s) about {needed / 1e9:.1f} GB of memory; {there / 1e9:.1f} GB are available")
+        raise NotEnoughMemory(f"{what} would take about {needed / 1e9:.1f} GB of memory; {there / 1e9:.1f} GB are available")
     if tell is not None and needed >= TOLD_FROM:
         tell(f"{what}: about {needed / 1e9:.1f} GB of memory")

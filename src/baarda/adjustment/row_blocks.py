@@ -73,26 +73,31 @@ def blocks_of(lin: Linearization, structure: Structure, inverse: Floats, damping
     damping : float
         Added to the diagonal of the scaled normal matrix.
     """
-    parts = max((len(c.parts) for c in lin.chunks), default=0)
-    table = np.zeros((len(lin.chunks), HEAD + 3 * parts), dtype=np.intp)
-    place, rows, hats = 0, 0, [0]
-    for k, (c, own) in enumerate(zip(lin.chunks, structure.point_part, strict=True)):
-        n, m = c.misclosure.shape
-        table[k, :HEAD] = m, len(c.parts), c.parts[own].start if own >= 0 else -1, place, rows
-        for j, p in enumerate(c.parts):
-            table[k, HEAD + 3 * j : HEAD + 3 + 3 * j] = p.start, len(p.positions), j != own
-        place += n * len(c.parts)
-        rows += n
-        hats.append(hats[-1] + n * m * m)
+    hats = [c.misclosure.size * c.misclosure.shape[1] for c in lin.chunks]
     point_inverse = inverse[structure.point_columns]
     prior = np.where(point_inverse > 0.0, np.sqrt(damping), 1.0)
     columns = structure.order[structure.cluster_columns]
     scalar = lin.chunks[0].first if len(lin.chunks) == 1 else np.concatenate([np.zeros(0, dtype=np.intp), *(c.first for c in lin.chunks)])
     return Blocks(
-        lin.values, table, structure.starts, structure.first_block, structure.block_chunk, structure.block_row, structure.first_point,
+        lin.values, table_of(lin, structure),
+        structure.starts, structure.first_block, structure.block_chunk, structure.block_row, structure.first_point,
         structure.first_column, structure.cluster_rows, structure.cluster_columns, structure.sparse, inverse[columns], point_inverse, prior,
-        np.array(hats, dtype=np.intp), np.ascontiguousarray(scalar),
+        np.cumsum([0, *hats], dtype=np.intp), np.ascontiguousarray(scalar),
     )  # fmt: skip
+
+
+def table_of(lin: Linearization, structure: Structure) -> Ints:
+    """Return the table of `Blocks`; -1 for the places of partials that are not stored."""
+    parts = max((len(c.parts) for c in lin.chunks), default=0)
+    table = np.zeros((len(lin.chunks), HEAD + 3 * parts), dtype=np.intp)
+    place, rows = 0, 0
+    for k, (c, own) in enumerate(zip(lin.chunks, structure.point_part, strict=True)):
+        table[k, :HEAD] = c.misclosure.shape[1], len(c.parts), c.parts[own].start if own >= 0 else -1, place, rows
+        for j, p in enumerate(c.parts):
+            table[k, HEAD + 3 * j : HEAD + 3 + 3 * j] = p.start, len(p.positions), j != own
+        place += len(c.first) * len(c.parts)
+        rows += len(c.first)
+    return table
 
 
 def with_partials(blocks: Blocks, lin: Linearization, spans: Ints) -> Blocks:

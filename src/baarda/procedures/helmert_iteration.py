@@ -136,6 +136,7 @@ class Run:
         control = Control(sum(f.objective for f in joint.facts), joint.count, settings, self.progress)
         converged = False
         before: Handles | None = None
+        straight = False  # whether the last step was neither damped nor bent nor lengthened
         old: Handles | None = None
         for _ in range(settings.iterations):
             datum = None if control.damping > 0.0 else tied
@@ -143,20 +144,20 @@ class Run:
             old = None
             steps = self.solved(datum)
             s = self.sums(steps, before)
-            relative, lengthened, plain = control.relative(s.cc), 1.0, before is not None
+            relative, lengthened, plain, bent = control.relative(s.cc), 1.0, straight, False
             if control.damping == 0.0 and before is not None and relative < 0.01:
                 lengthened = extrapolation(s.cb, s.bb, s.cc)
-                plain = lengthened == 1.0
+                plain = straight and lengthened == 1.0
             predicted = 2.0 * lengthened * s.cl - lengthened**2 * s.cc
             unbent, full = steps, control.damping == 0.0
             if lengthened == 1.0 and control.bends(relative):
-                steps, plain = self.bent(datum, steps), False
+                steps, plain, bent = self.bent(datum, steps), False, True
             trials = parts.each(tasks.tried, self.stands, steps, lengthened, control.near(relative))
             value = float(sum(parts.all(tasks.objective_of, trials)))
             if not control.takes(value, predicted, relative):
-                before = None
+                before, straight = None, False
                 continue
-            before = unbent if full and lengthened == 1.0 else None
+            before, straight = unbent if full and lengthened == 1.0 else None, full and lengthened == 1.0 and not bent
             if full and relative <= REUSE:
                 old = self.stands
             self.stands = parts.each(tasks.stand_of, trials)

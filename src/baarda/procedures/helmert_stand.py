@@ -162,12 +162,12 @@ class Part:
         limit, held, there = memory_limit(), resident(), memory.available()
         if np.isfinite(limit) and held + needed > PAUSE * limit:
             raise NotEnoughMemory(
-                f"{what} of part {self.source.number} need(s) about {needed / 1e9:.3g} GB of memory; the worker may take "
+                f"{what} of part {self.source.number} would take about {needed / 1e9:.3g} GB of memory; the worker may take "
                 f"{limit / 1e9:.3g} GB and holds {held / 1e9:.3g} GB already: split into more parts, take more workers, or give them more"
             )
         if needed > there:
             raise NotEnoughMemory(
-                f"{what} of part {self.source.number} need(s) about {needed / 1e9:.3g} GB of memory; {there / 1e9:.3g} GB are available: "
+                f"{what} of part {self.source.number} would take about {needed / 1e9:.3g} GB of memory; {there / 1e9:.3g} GB are available: "
                 "split into more parts"
             )
 
