@@ -565,6 +565,9 @@ def test_a_part_without_control_is_named():
         with pytest.raises(Singular) as caught:
             baarda.adjust(network, solver=solver)
         assert " Z" in str(caught.value)
+        named = ", ".join(network.images.labels[5:8])
+        assert "the block falls into 2 parts that no point joins: 5 image(s) (" in str(caught.value)
+        assert f"; 4 image(s) ({named}, ...) with 30 point(s)" in str(caught.value)
 
 
 def test_two_free_parts_are_named():
@@ -573,7 +576,7 @@ def test_two_free_parts_are_named():
     roles, states = np.zeros_like(one.points.roles), np.full_like(one.points.states, FREE)
     network = replace(one, points=replace(one.points, roles=roles, states=states))
     for solver in ("block", "dense"):
-        with pytest.raises(Singular):
+        with pytest.raises(Singular, match="falls into 2 parts"):
             baarda.adjust(network, solver=solver)
 
 

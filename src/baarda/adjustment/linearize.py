@@ -153,7 +153,7 @@ def evaluated_groups(groups: Sequence[Kind], network: Network, unknowns: Unknown
     network : Network
     unknowns : Unknowns
     """
-    if len(kept_positions(unknowns).get(("point", 3), ())) != 3:
+    if not (unknowns["point"].columns.reshape(-1, 3) >= 0).any(axis=0).all():  # a coordinate that is fixed everywhere has no partials
         return set()
     every: list[Any] = list(groups)
     others = [g for g in every if not hasattr(g, "pieces") and getattr(g, "kind", "point") == "point"]

@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 from baarda.adjustment import kernels, memory
 from baarda.adjustment.block import BlockSolver
 from baarda.adjustment.camera_choice import with_cameras
+from baarda.adjustment.connection import separate_parts
 from baarda.adjustment.datum import Datum, Defect, find_defect, minimal_columns
 from baarda.adjustment.dense import DenseSolver
 from baarda.adjustment.initial import complete
@@ -25,7 +26,7 @@ from baarda.adjustment.robust import adjust_under_law, check_law
 from baarda.adjustment.solver import Solver
 from baarda.adjustment.structure import analyse, inner_points
 from baarda.cameras import FREE
-from baarda.errors import DatumDefect, RedundancyNotPositive, UsageError
+from baarda.errors import DatumDefect, RedundancyNotPositive, Singular, UsageError
 from baarda.network import CHECK, Network, State, Unknowns, unknowns_of
 from baarda.observations import ImagePoints, Kind, direct_observations
 
@@ -140,11 +141,18 @@ def adjust(network: Network, **options: Any) -> Adjustment:
     """
     settings = Settings.of(network, options)
     with threadpool_limits(limits=1, user_api="blas"):  # two threads are slower here and sum in another order
-        return _adjust(network, settings)
+        prepared, aside, notes = prepare(network, settings)
+        try:
+            return _adjust(network, settings, prepared, aside, notes)
+        except (Singular, DatumDefect) as error:
+            parts = separate_parts(prepared, active_groups(prepared, ~aside))
+            if not parts:
+                raise
+            names = (error.names,) if isinstance(error, Singular) else ()
+            raise type(error)(f"{error}; {parts}", *names) from None
 
 
-def _adjust(network: Network, settings: Settings) -> Adjustment:
-    prepared, aside, notes = prepare(network, settings)
+def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDArray[np.bool_], notes: list[str]) -> Adjustment:
     prepared, more = complete(prepared, aside)
     shift = -prepared.centroid()
     prepared = prepared.shifted(shift)
@@ -160,6 +168,9 @@ def _adjust(network: Network, settings: Settings) -> Adjustment:
         "the observations",
         settings.tell,
     )
+    most = max((len(g) for g in groups if isinstance(g, ImagePoints)), default=0)
+    if settings.tell is not None and kind == "block" and most >= kernels.COMPILE_FROM and not kernels.cached():
+        settings.tell("compiling loops for the first time, about a quarter of a minute (see: baarda warmup)")
     rank = rank_for(groups, start.points)
     arranged = Arrangement.of(groups, rank if kind == "block" else None, prepared)
     lin = linearize(prepared, start, unknowns, arranged, settings.jobs)
@@ -175,8 +186,6 @@ def _adjust(network: Network, settings: Settings) -> Adjustment:
     structure = analyse(lin, rank, start.points) if kind == "block" else None
     if structure is not None:
         memory.check(memory.of_fronts(structure), "the factor and its inverse", settings.tell)
-        if settings.tell is not None and len(structure.block_row) >= kernels.COMPILE_FROM and not kernels.cached():
-            settings.tell("compiling loops for the first time, about half a minute (see: baarda warmup)")
 
     def factor(lin: Linearization, datum: Datum, damping: float = 0.0) -> Solver:
         if structure is None:
