@@ -131,3 +131,12 @@ def dying_condense(job):
     _values = lake_sums._values
     with mock.patch("baarda.procedures.lake_sums._values", values), mock.patch("baarda.procedures.lake_sums.PIECE", 1000):
         return lake_sums.condense_file(job)
+
+
+def full_disk_once(table, place):
+    """Write the table of a part of a large block; fail as on a full disk when the first worker gets there."""
+    from baarda.report.helmert_report import PartTables
+
+    if first_time("full table"):
+        raise OSError(errno.ENOSPC, "No space left on device", str(place))
+    PartTables("csv")(table, place)

@@ -206,11 +206,17 @@ def test_command_line(blocks, tmp_path):
     (two / "bad.txt").write_text("nonsense")
     run = CliRunner().invoke(app, ["batch", f"{two}/b*", "--out", str(out), "--jobs", "1"])
     assert run.exit_code == 2 and "1 of 2 blocks have no tested result" in run.stderr and "1 of 2 blocks converged" in run.stdout
+    lines = run.stderr.splitlines()
+    first, last = (next(line for line in lines if line.startswith(f"{k} of 2  ")) for k in (1, 2))
+    assert first.endswith(" s left") and not last.endswith("left")
+    full = next(row["message"] for row in json.loads((out / "batch.json").read_text())["blocks"] if row["message"])
+    assert len(full) > 200 and full not in run.stderr and f"{full[:140]}" in last and last.endswith(" ...")
+    assert full[:140] in lines[-1] and lines[-1].endswith(" ...")
     folder = out / "blocks" / block_name(str(two / "b0"))
     assert json.loads((folder / "result.json").read_text())["schema"] == "baarda.result/1" and (folder / "report.html").is_file()
     (two / "bad.txt").unlink()
     again = CliRunner().invoke(app, ["batch", f"{two}/b*", "--out", str(out), "--jobs", "1", "--json"])
-    assert again.exit_code == 0 and "kept" in again.stderr
+    assert again.exit_code == 0 and "kept" in again.stderr and "left" not in again.stderr
     assert json.loads(again.stdout) == json.loads((out / "batch.json").read_text())
     for wrong in (["--alpha", "2"], ["--tables", "xls"], ["--language", "xx"], ["--criterion", "none"]):
         refused = CliRunner().invoke(app, ["batch", f"{two}/b*", "--out", str(tmp_path / "none"), *wrong])

@@ -19,6 +19,82 @@ def run(*arguments, cwd=None, **options):
     return subprocess.run(command, capture_output=True, text=True, encoding="utf-8", cwd=cwd, env=environment, check=False, **options)
 
 
+class Clock:
+    """Stands for the module `time`: moves only when told to."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def perf_counter(self):
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    from baarda.cli import progress
+
+    monkeypatch.setattr(progress, "time", stopped := Clock())
+    return stopped
+
+
+def test_iterations_tell_when_they_end(clock, capsys):
+    from baarda.adjustment.result import Iteration
+    from baarda.cli.progress import Iterations
+
+    tell = Iterations(-5.0, 1e-10)
+    steps = [(1.0, 0.0, True), (1e-2, 0.0, True), (1e-3, 0.0, True), (0.5, 0.0, False), (1e-3, 1e-7, True), (1e-4, 0.0, True)]
+    steps += [(1e-5, 0.0, True), (1e-10, 0.0, True), (1e-10, 0.0, True)]
+    for count, (relative, damping, accepted) in enumerate(steps, start=1):
+        clock.now += 10.0
+        tell(Iteration(count, 12.5, relative, damping, accepted))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "iteration  1  v'Pv 12.5  relative step 1.0e+00  15.0 s"
+    ends = [line.partition(" s, ")[2] for line in lines]
+    # only after two plain steps in a row; 1e-3 by a rate of 0.1 needs 7 steps of 10 s; nothing at the end
+    assert ends == [
+        "",
+        "about 40 s of iterations left",
+        "about 70 s of iterations left",
+        "",
+        "",
+        "",
+        "about 50 s of iterations left",
+        "",
+        "",
+    ]
+
+
+def test_pieces_are_told_now_and_then(clock, capsys):
+    from baarda.cli.progress import Counted
+
+    tell = Counted("data sets simulated")
+    for done in range(10):
+        tell(done, 10)
+        clock.now += 1.5
+    assert capsys.readouterr().err.splitlines() == [
+        "2 of 10 data sets simulated, about 12 s left",
+        "4 of 10 data sets simulated, about 9 s left",
+        "6 of 10 data sets simulated, about 6 s left",
+        "8 of 10 data sets simulated, about 3 s left",
+    ]
+
+
+def test_counting_the_simulated_data_sets_changes_nothing():
+    import numpy as np
+
+    import baarda
+    from baarda.hypotheses.levels import Options
+    from baarda.procedures.testing import analyse
+    from networks import ring
+
+    result, options, seen = baarda.adjust(ring(images=4, points=8, control=4)), Options(replicas=99), []
+    plain, told = analyse(result, options), analyse(result, options, lambda done, total: seen.append((done, total)))
+    assert seen == [(0, 99)]
+    assert [t.name for t in told.tests] == [t.name for t in plain.tests]
+    for a, b in zip(told.tests, plain.tests, strict=True):
+        assert np.array_equal(a.statistic, b.statistic, equal_nan=True) and np.array_equal(a.p_value, b.p_value, equal_nan=True)
+
+
 @pytest.fixture(scope="module")
 def two_demos(tmp_path_factory):
     """The demo, twice, from a folder without the sources."""
@@ -35,6 +111,15 @@ def test_demo_writes_the_folder_of_the_contract(two_demos):
     assert "4148 observations" in first.stdout
     assert "v'Pv" in first.stderr
     assert "v'Pv" not in first.stdout
+    told = first.stderr.splitlines()
+    adjusted = told.index("adjusted: s0 1.615, redundancy 3725, image residuals 0.153 px rms per coordinate")
+    assert told[0].startswith("iteration  1  v'Pv ") and told[adjusted - 1].startswith("iteration ")
+    assert [line for line in told[adjusted + 1 :] if line.endswith(" ...")] == [
+        "redundancy numbers and precision ...",
+        "tests and their simulated null laws ...",
+        "laws of errors, fitted and simulated ...",
+        "tables, figures and report ...",
+    ]
 
 
 def test_demo_numbers(two_demos):
@@ -302,6 +387,12 @@ def test_adjustment_under_a_law(data, tmp_path):
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "r" / "result.json").read_text())
     assert result["law_of_errors"]["name"] == "huber"
+    steps = [line for line in done.stderr.splitlines() if line.startswith("iteration")]
+    under_the_law = [k for k, line in enumerate(steps) if "- log L" in line]
+    assert under_the_law == list(range(under_the_law[0], len(steps))) and under_the_law[0] > 0  # least squares comes first
+    assert all("v'Pv" in line for line in steps[: under_the_law[0]])
+    assert f"- log L {result['history'][-1]['objective']:.10g} " in steps[-1]
+    assert "adjusted: huber law of errors, scale " in done.stderr and "simulated" not in done.stderr
     names = {t["name"] for t in result["tests"]}
     assert "check_points" in names
     assert not names & {"global_variance_factor", "data_snooping", "control_points"}

@@ -17,6 +17,7 @@ import baarda.distributions as D
 from baarda.distributions import kernels as K
 from baarda.distributions.condensed import Condensed, condense, condense_stream
 from baarda.distributions.fitting import fit
+from baarda.distributions.generalised_normal import GeneralisedNormal
 from baarda.distributions.modulated import ModulatedNormal
 from baarda.distributions.sample import Sample
 from baarda.distributions.tabulated import _table, log_likelihood, log_likelihood_gradient
@@ -387,3 +388,12 @@ def test_both_sides_are_put_together_only_about_the_centre() -> None:
     of = Sample.of_condensed(condense(x))
     assert of.reduced(folded=False, coarse=False) is of
     assert Sample.of(x[:10], 0.0).reduced(folded=True, coarse=True).points.size == 10
+
+
+@pytest.mark.parametrize("p", [0.4, 1.0, 1.5, 2.0, 7.0])
+def test_score_of_the_generalised_normal_law_at_its_centre(p):
+    """For p < 1 the power is infinite there: the score is 0 without a warning, and elsewhere the derivative of the log-density."""
+    z = np.array([0.0, -0.0, 1e-300, -0.3, 2.0, 1e6])
+    score = GeneralisedNormal._score(z, p)
+    assert (score[:2] == 0.0).all()
+    np.testing.assert_allclose(score[2:], [-p * np.sign(v) * abs(v) ** (p - 1.0) for v in z[2:].tolist()], rtol=1e-14)

@@ -161,7 +161,8 @@ def test_round_trip_of_hostile_labels_and_any_number(data, labels, tmp_path_fact
     n = len(labels)
     array = lambda *shape: data.draw(hnp.arrays(float, shape, elements=number))  # noqa: E731
     sigma = data.draw(hnp.arrays(float, (n, 2), elements=st.floats(1e-12, 1e12)))
-    camera = cameras.create(labels[0], cameras.model("pinhole"), {"principal_distance": 1.0, "principal_point_x": array(1)[0]})
+    at = data.draw(st.floats(-1e12, 1e12))
+    camera = cameras.create(labels[0], cameras.model("pinhole"), {"principal_distance": 1.0, "principal_point_x": at})
     network = Network(
         (camera,),
         Images.make(labels, position=array(n, 3)),
@@ -327,6 +328,24 @@ BROKEN = {
     "duplicate camera": ({"cameras__csv": "camera,model\n1,pinhole\n1,brown\n"}, "cameras.csv", 3, "'1' appears twice (first in line 2)"),
     "duplicate image": (edited("images.csv", 3, "A,2,0,10,0,0,0"), "images.csv", 3, "'A' appears twice (first in line 2)"),
     "duplicate point": (edited("points.csv", 5, "1,tie,3,3,0,,,"), "points.csv", 5, "'1' appears twice (first in line 2)"),
+    "absurd parameter": (
+        edited("camera_parameters.csv", 3, "1,principal_point_x,-1e200"),
+        "camera_parameters.csv",
+        3,
+        "value = -1e+200 is beyond 1e+12",
+    ),
+    "absurd origin": (
+        {"cameras__csv": "camera,model,origin_x,origin_y\n1,pinhole,0.5,1e13\n"},
+        "cameras.csv",
+        2,
+        "the origin = 10000000000000.0 is beyond 1e+12",
+    ),
+    "absurd unknown": (
+        {"unknowns__csv": "name,value,sigma\ncamera 1: principal_distance,1e100,1\n"},
+        "unknowns.csv",
+        2,
+        "value = 1e+100 is beyond 1e+12",
+    ),
     "duplicate parameter": (
         edited("camera_parameters.csv", 3, "1,principal_distance,5"),
         "camera_parameters.csv",

@@ -362,6 +362,8 @@ def test_split_adjust_and_adjust_again(project, tmp_path):
     assert run.exit_code == 0 and "part-002: " in run.stderr, run.output
     run = baarda_of("adjust", tmp_path / "parts", "--out", tmp_path / "out")
     assert run.exit_code == 0 and "Adjusted in 3 parts" in run.stdout, run.output
+    assert "redundancy numbers, precision and tests of 3 parts, and their tables ...\nfigures and report ...\n" in run.stderr
+    assert f"adjusted: s0 {json.loads((tmp_path / 'out' / 'result.json').read_text())['sigma0']['aposteriori']:.4g}, " in run.stderr
     whole = baarda_of("adjust", project, "--out", tmp_path / "whole", "--solver", "block")
     assert whole.exit_code == 0
     found, plain = (json.loads((tmp_path / name / "result.json").read_text()) for name in ("out", "whole"))

@@ -16,6 +16,7 @@ from baarda.executors import ClusterLost, TaskFailed
 from baarda.procedures.helmert import finish, gathered_tables, solve_blocked
 from baarda.procedures.partition_folder import write_partition
 from baarda.procedures.task_engines import open_engine
+from cluster_tasks import full_disk_once
 from test_cluster import Cluster, with_dask
 from test_helmert import aerial
 
@@ -127,6 +128,33 @@ def test_a_worker_lost_while_the_tables_are_written(cluster, source, tmp_path):
         write_blocked(kill_in_the_middle, out[1], "p")
     files = [{p.relative_to(o): p.read_bytes() for p in o.rglob("*") if p.is_file()} for o in out]
     assert files[0] == files[1]
+
+
+def test_a_full_disk_on_one_worker_leaves_nothing_and_the_next_run_is_whole(cluster, source, tmp_path):
+    from baarda.report.helmert_report import write_blocked
+
+    complete(cluster)
+    out = [tmp_path / name for name in ("plain", "there")]
+    with open_engine() as e:
+        blocked = solve_blocked(source, e)
+        write_blocked(lambda place, write: finish(blocked, e, None, place, write), out[0], "p")
+    with open_engine(cluster.address) as e:
+        joined = solve_blocked(source, e)
+        with pytest.raises((OSError, TaskFailed), match="No space left"):
+            write_blocked(lambda place, _: finish(joined, e, None, place, full_disk_once), out[1], "p")
+        assert not out[1].exists()
+        assert not [p for p in tmp_path.iterdir() if p != out[0]]  # nothing half-written beside it
+        write_blocked(lambda place, write: finish(joined, e, None, place, write), out[1], "p")
+    files = [{p.relative_to(o): p.read_bytes() for p in o.rglob("*") if p.is_file()} for o in out]
+    assert files[0] == files[1]
+
+
+def test_a_corrupt_part_is_told(cluster, tmp_path):
+    source = write_partition(aerial(12), 2, tmp_path / "p")
+    table = next(source.place(0).glob("image_points*"))
+    table.write_bytes(table.read_bytes()[:200] + b"\x00\xff" * 50)
+    with open_engine(cluster.address) as e, pytest.raises(TaskFailed, match="split again"):
+        solve_blocked(source, e)
 
 
 def test_a_changed_part_is_told(cluster, tmp_path):

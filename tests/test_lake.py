@@ -186,6 +186,31 @@ def test_a_corrupt_file_is_named_and_the_pass_goes_on_afterwards(raw, tmp_path):
     assert json.loads(mine["result.json"])["source"]["sha256"] == json.loads(plain["result.json"])["source"]["sha256"]
 
 
+def test_the_time_left_does_not_count_what_an_earlier_pass_read(monkeypatch, capsys):
+    from types import SimpleNamespace
+
+    from baarda.cli import residuals as verb
+    from baarda.report import lake_report
+
+    now = [0.0]
+
+    def passes(*_, progress, **__):
+        for done in (4, 5, 6, 10):  # 3 of 10 had been read
+            now[0] += 10.0 if done < 10 else 40.0
+            progress(done, 10, 1000 * done)
+
+    monkeypatch.setattr(verb, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(lake_report, "run_lake", passes)
+    verb.study_lake("lake", None, (None,) * 4, QUICK, {}, (None, 1), False, 0.0)
+    assert capsys.readouterr().err.splitlines() == [
+        " 4 of 10 files, 4000 rows, 10 s, about 60 s left",
+        " 5 of 10 files, 5000 rows, 20 s, about 50 s left",
+        " 6 of 10 files, 6000 rows, 30 s, about 40 s left",
+        "10 of 10 files, 1e+04 rows, 70 s",
+        "laws of errors, fitted and simulated; figures and tables ...",
+    ]
+
+
 def test_an_earlier_pass_over_other_files_is_not_gone_on_with(raw, tmp_path):
     mine, saved = tmp_path / "lake", tmp_path / "saved.npz"
     shutil.copytree(raw, mine)
@@ -292,6 +317,7 @@ def test_command_line(raw, tmp_path):
     document = json.loads(run.stdout)
     assert document["counts"] == {"values": 45000, "set_aside": 0, "groups": 40} and document["source"]["format"] == "parquet"
     assert "5 files" in run.stderr and "memory of a worker: 600 MB" in run.stderr
+    assert "5 of 5 files, 4.5e+04 rows, " in run.stderr and run.stderr.count(" left") == 0  # a short pass tells only its end
     rows = (out / "tables" / "histograms.csv").read_text().splitlines()
     assert sum(int(line.rsplit(",", 1)[1]) for line in rows[1:]) == 45000
     assert json.loads((out / "run.json").read_text())["peak_memory_of_a_worker"] > 0

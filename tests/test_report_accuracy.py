@@ -13,12 +13,14 @@ import baarda
 from baarda.errors import UsageError
 from baarda.formats import dbat
 from baarda.hypotheses.levels import Options
-from baarda.network import CHECK
+from baarda.network import CHECK, Points
 from baarda.observations import Distances
 from baarda.procedures.testing import analyse
 from baarda.report import page
 from baarda.report.accuracy import Lengths, accuracy_json, accuracy_of, length_deviations, lengths_of
+from baarda.report.drawings import check_vectors
 from baarda.report.result_folder import result_json
+from baarda.report.sections.base import Figure
 from networks import ring, with_distances
 
 
@@ -181,3 +183,29 @@ def test_statement_with_enough_points():
 def test_no_statement_without_check_points_and_lengths():
     assert section(analyse(baarda.adjust(ring(control=5)))) is None
     assert result_json(analyse(baarda.adjust(ring(control=5))))["accuracy"] is None
+
+
+def test_points_without_coordinates_are_not_drawn():
+    """A tie point without rays was set aside, and has no coordinates: the plan of the check points must not look at it."""
+    network = ring(control=5, checks=2, noise=0.2)
+    points = network.points
+    coordinates, labels = np.array(points.coordinates), (*points.labels, "ZZ")
+    lone = Points.make(labels, np.concatenate([coordinates, np.full((1, 3), np.nan)]))
+    more = {
+        name: np.concatenate([getattr(points, name), getattr(lone, name)[-1:]])
+        for name in ("roles", "states", "given", "sigmas", "correlations")
+    }
+    plain, whole = (analyse(baarda.adjust(n)) for n in (network, replace(network, points=replace(lone, **more))))
+    assert np.isnan(whole.adjustment.network.points.coordinates[-1]).all()
+    pages = [page.sections(a) for a in (plain, whole)]
+    figures = [[b.svg for s in sections for b in s.blocks if isinstance(b, Figure)] for sections in pages]
+    assert len(figures[0]) == len(figures[1]) > 5
+    assert any("check-vectors" in svg for svg in figures[1])
+    assert not any("nan" in svg.lower() for svg in figures[1])
+
+
+def test_vectors_of_points_of_which_some_have_no_coordinates():
+    points = np.array([[0.0, 0.0, 0.0], [10.0, 5.0, 1.0], [np.nan, np.nan, np.nan]])
+    d = np.array([[0.1, 0.2, -0.1]])
+    with_it, without = (check_vectors(p, points[:1], d, ["1"], "m", "m") for p in (points, points[:2]))
+    assert with_it == without
