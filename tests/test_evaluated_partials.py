@@ -16,8 +16,12 @@ from baarda.adjustment.solve import Settings, active_groups
 from baarda.geometry import rotation as rot
 from baarda.network import State
 from baarda.observations import kernels as image_kernels
+from baarda.procedures.helmert import gathered_tables, solve_blocked
+from baarda.procedures.partition_folder import write_partition
+from baarda.procedures.task_engines import open_engine
 from networks import BROWN, ring
 from test_block_solver import NETWORKS, made, observed_orientation, system
+from test_helmert import aerial
 
 
 @pytest.fixture
@@ -186,3 +190,16 @@ def test_slow_convergence_is_followed_to_its_end():
     assert r.status == "converged"
     _, change = r.solver.least_squares(r.lin.misclosure)
     assert np.linalg.norm(change) <= 2e-10 * np.linalg.norm(r.lin.misclosure)
+
+
+def test_parts_of_a_network_with_two_optics(evaluated, tmp_path):
+    n = two_optics(aerial(16))
+    whole = baarda.adjust(n, solver="block")
+    assert [c.evaluate is not None for c in whole.lin.chunks][:2] == [True, True]
+    with open_engine() as engine:
+        found = gathered_tables(solve_blocked(write_partition(n, 3, tmp_path / "p"), engine), engine)["unknowns"]
+    place = {name: k for k, name in enumerate(found["name"])}
+    order = [place[name] for name in whole.unknowns["name"]]
+    sigma = whole.unknowns["sigma"]
+    assert np.abs((found["value"][order] - whole.unknowns["value"]) / sigma).max() < 1e-9
+    np.testing.assert_allclose(found["sigma"][order], sigma, rtol=1e-9)
