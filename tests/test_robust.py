@@ -1,5 +1,7 @@
 """Maximum-likelihood adjustment under laws of errors, and critical values under them."""
 
+import html
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -14,11 +16,15 @@ from baarda.distributions import law
 from baarda.errors import UsageError
 from baarda.hypotheses import run
 from baarda.hypotheses._error_kurtosis import kurtosis_of_errors
+from baarda.hypotheses.levels import Options
 from baarda.network import State
 from baarda.procedures import error_law
 from baarda.procedures.error_law import critical_values, critical_values_of_projector
 from baarda.procedures.testing import analyse
-from networks import ring
+from baarda.report import page
+from baarda.report.result_folder import result_json
+from baarda.report.translation import catalogue, language, tr
+from networks import ring, with_distances
 
 LAWS = [
     ("normal", {}),
@@ -176,6 +182,40 @@ def test_evidence_leaves_out_what_least_squares_alone_has():
     assert "check_points" in kept
     with pytest.raises(UsageError, match="least squares"):
         critical_values(r, "radico")
+
+
+def test_what_is_not_judged_is_listed_with_its_reason(network):
+    checked = with_distances(ring(**{**SMALL, "checks": 3}), [(5, 6), (7, 8)])
+    least_squares, huber, cauchy = (
+        analyse(baarda.adjust(checked, robust=name), Options(replicas=19)) for name in (None, "huber", "cauchy")
+    )
+    apriori = analyse(huber.adjustment, Options(replicas=19, sigma="apriori"))
+    assert result_json(least_squares)["not_applicable"] == []
+    assert {t.name for t in least_squares.tests} >= {"jarque_bera", "goodness_of_fit", "data_snooping", "control_points"}
+    for a in (huber, cauchy, apriori):
+        document = result_json(a)
+        json.dumps(document, allow_nan=False)
+        made, listed = [t["name"] for t in document["tests"]], [t["name"] for t in document["not_applicable"]]
+        assert not set(made) & set(listed)
+        assert set(listed) >= set(NOT_APPLICABLE)
+        # nothing vanishes: what least squares would judge is judged or listed
+        assert {t.name for t in least_squares.tests} <= set(made) | set(listed)
+        assert all(len(t["reason"]) > 20 for t in document["not_applicable"])
+        assert (
+            document["laws"] == [] and document["law_study"] is document["critical_values"] is document["accuracy"]["vdi_vde_2634"] is None
+        )
+        for code in ("en", "de"):
+            with language(code):
+                text = html.unescape(page.html(a, page.sections(a)))
+                assert all(tr(t["reason"]) in text for t in document["not_applicable"])
+                assert code == "en" or all(t["reason"] in catalogue(code) for t in document["not_applicable"])
+    assert "check_points" in result_json(huber)["tests"][0]["name"]
+    assert not cauchy.tests and "check_points" in cauchy.not_applicable  # redescending, and few redundant observations
+    assert not apriori.tests and "a posteriori" in apriori.not_applicable["check_points"]
+    row = result_json(apriori)["check_points"][0]
+    assert row["dx"] is not None and row["statistic"] is row["p_value"] is row["rejected"] is None
+    assert "control_points" not in analyse(baarda.adjust(ring(**{**SMALL, "fixed_control": True}), robust="huber")).not_applicable
+    assert "vdi_vde_2634" not in analyse(baarda.adjust(network, robust="huber")).not_applicable
 
 
 def test_covariance_factor_is_the_sandwich_for_few_unknowns():

@@ -1,5 +1,6 @@
 """``python -m baarda`` is the command line."""
 
-from baarda.cli import main
+if __name__ == "__main__":
+    from baarda.cli import main
 
-main()
+    main()

@@ -14,19 +14,21 @@ import os
 import queue
 import signal
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing.connection import wait
 from typing import Any, Generic, TypeVar
 
 from baarda import __version__
 from baarda.distributions.workers import worker_count
 from baarda.errors import BaardaError, MissingExtra, UsageError
 
-__all__ = ["ClusterLost", "Failure", "Outcome", "TaskFailed", "Workers", "memory_limit", "open_workers"]
+__all__ = ["ClusterLost", "Failure", "Outcome", "TaskFailed", "Workers", "end_with_parent", "memory_limit", "open_workers"]
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -35,6 +37,7 @@ _PATIENCE = 10.0  # seconds to reach a scheduler
 _LOOK = 0.5  # seconds between two looks whether the cluster is still there
 _COUNT_AGAIN = 5.0  # seconds between two counts of the workers
 _FEWEST_AHEAD = 16  # tasks handed over even where no worker is there yet: a cluster that grows by demand must see some
+_FAREWELL = 5.0  # seconds for processes that were told to end
 _DEATHS = 2  # of a process that worked on one task alone
 Told = Callable[[str], None]
 
@@ -407,8 +410,11 @@ class _Processes(Workers):
             whole = True
         finally:
             if not whole:
-                for child in set(multiprocessing.active_children()) - before:
+                begun = set(multiprocessing.active_children()) - before
+                for child in begun:
                     child.terminate()
+                for child in begun:  # so that none writes any more when what they left is removed
+                    child.join(_FAREWELL)
             pool.shutdown(wait=whole, cancel_futures=True)
 
 
@@ -420,8 +426,28 @@ class _Died(Exception):
 
 
 def _deaf() -> None:
-    """Leave Ctrl-C to the process that waits for the results."""
+    """Leave Ctrl-C to the process that waits for the results, and end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
+
+
+def end_with_parent() -> None:
+    """Let this process end as soon as the one that began it has: a killed command cannot tell its workers.
+
+    For the beginning of every worker process; elsewhere nothing happens.
+
+    Examples
+    --------
+    >>> end_with_parent()
+    """
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_after, args=(parent.sentinel,), daemon=True).start()
+
+
+def _end_after(sentinel: int) -> None:
+    wait([sentinel])
+    os._exit(1)  # nobody is left to be told
 
 
 # ---- Dask -----------------------------------------------------------------------------------------------------------------------------

@@ -132,7 +132,7 @@ def adjust(
                 "--solver": solver == "dense",
                 "--robust": robust,
                 "--audit": audit,
-                "--snoop": snoop or snoop_law,
+                "--snoop": snoop or snoop_law or snoop_unit != "coordinate",
                 "--select": select,
                 "--cross-validate": cross_validate,
                 "--strategy": strategy,

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from baarda import __version__
+from baarda.cli import unforeseen
 from baarda.errors import BaardaError
 
 app = typer.Typer(
@@ -139,7 +140,7 @@ def one_blas_thread(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def guarded(function: Callable[..., None]) -> Callable[..., None]:
-    """Turn every foreseen failure into one message and the exit code of the contract."""
+    """Turn every failure into one message and the exit code of the contract: 1 is left to a gate that failed."""
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> None:
@@ -161,6 +162,11 @@ def guarded(function: Callable[..., None]) -> Callable[..., None]:
             place = f" {error.filename}" if error.filename else ""
             typer.echo(f"baarda: cannot read or write{place}: {error.strerror or error}", err=True)
             raise typer.Exit(4) from None
+        except (typer.Exit, typer.Abort, typer.BadParameter):
+            raise
+        except Exception as error:
+            typer.echo(f"baarda: {unforeseen(error)}", err=True)
+            raise typer.Exit(2) from None
 
     return run
 

@@ -40,6 +40,7 @@ from baarda.cli.base import (
     app,
     guarded,
 )
+from baarda.cli.progress import left, shortened
 
 
 @app.command()
@@ -121,12 +122,15 @@ def batch(
         counted["kept"] += kept
         if not quiet:
             what = "kept" if kept else row["status"].replace("_", " ")
-            told = f": {row['message']}" if row["message"] else "" if row["sigma0"] is None else f", s0 {row['sigma0']:.4g}"
-            typer.echo(f"{done:>{len(str(total))}} of {total}  {row['source']}  {what}{told}", err=True)
+            told = f": {shortened(row['message'])}" if row["message"] else "" if row["sigma0"] is None else f", s0 {row['sigma0']:.4g}"
+            worked = done - counted["kept"]  # blocks of an earlier run took no time
+            # only once each worker may have done one: before, the others' work is not counted
+            rest = left(time.perf_counter() - begun, worked, total - done) if worked >= workers.count else ""
+            typer.echo(f"{done:>{len(str(total))}} of {total}  {row['source']}  {what}{told}{rest}", err=True)
 
     try:
         with open_workers(cluster, jobs, tell=tell) as workers:
-            name = workers.name
+            name, begun = workers.name, time.perf_counter()
             rows = run_batch(work, writer, workers, progress)
     except (KeyboardInterrupt, ClusterLost) as stopped:
         reason = "interrupted" if isinstance(stopped, KeyboardInterrupt) else str(stopped)
@@ -147,7 +151,8 @@ def batch(
     if study.exit_code:
         lost = [r for r in study.rows if r["exit_code"]]
         typer.echo(
-            f"baarda: {len(lost)} of {len(study.rows)} blocks have no tested result; the first: {lost[0]['source']}: {lost[0]['message']}",
+            f"baarda: {len(lost)} of {len(study.rows)} blocks have no tested result; "
+            f"the first: {lost[0]['source']}: {shortened(lost[0]['message'])}",
             err=True,
         )
         raise typer.Exit(study.exit_code)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from baarda.cli.base import Alpha, Cluster, Json, Language, Out, Quiet, Seed, Strict, Tables, app, guarded
+from baarda.cli.progress import left
 from baarda.errors import UsageError
 
 if TYPE_CHECKING:
@@ -153,17 +154,23 @@ def study_lake(
     from baarda.report.lake_report import run_lake
 
     tell = None if quiet else lambda text: typer.echo(text, err=True)
-    last = [started]
+    last, before = [started], [-1]  # before: files that an earlier run had read
 
     def progress(done: int, total: int, rows: int) -> None:
         now = time.perf_counter()
+        if before[0] < 0:
+            before[0] = done - 1
         if done == total or now - last[0] > 2.0:
             last[0] = now
-            typer.echo(f"{done:>{len(str(total))}} of {total} files, {rows:.4g} rows, {now - started:.0f} s", err=True)
+            rest = left(now - begun, done - before[0], total - done)
+            typer.echo(f"{done:>{len(str(total))}} of {total} files, {rows:.4g} rows, {now - started:.0f} s{rest}", err=True)
+        if done == total:
+            typer.echo("laws of errors, fitted and simulated; figures and tables ...", err=True)
 
     column, group, sigma, redundancy = columns
     cluster, jobs = who
     with open_workers(cluster, jobs, tell=tell) as workers:
+        begun = time.perf_counter()
         return run_lake(
             address,
             target,

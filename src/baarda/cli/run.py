@@ -12,6 +12,7 @@ from typing import Any
 import typer
 
 from baarda.cli.base import one_blas_thread
+from baarda.cli.progress import Counted, Iterations, first_answer, stage
 from baarda.errors import OutputError, UsageError
 
 
@@ -36,6 +37,7 @@ def adjust_and_report(
 ) -> None:
     """Adjust a network with the procedures of a plan, test it, write the folder, print verdict or JSON, leave with the exit code."""
     from baarda.adjustment import adjust as adjust_network
+    from baarda.adjustment.solve import Settings
     from baarda.formats import covariance_file, geojson
     from baarda.formats.folder import check_target
     from baarda.hypotheses.levels import Options
@@ -61,12 +63,7 @@ def adjust_and_report(
     if points is not None and points.exists():
         raise OutputError(f"{points} exists")
 
-    def progress(step: Any) -> None:
-        relative = "" if step.relative_step is None else f"  relative step {step.relative_step:.1e}"
-        damping = f"  damping {step.damping:.0e}" if step.damping else ""
-        taken = "" if step.accepted else "  rejected"
-        typer.echo(f"iteration {step.count:>2}  v'Pv {step.objective:.10g}{relative}{damping}{taken}", err=True)
-
+    progress = None if quiet else Iterations(started, Settings.tolerance, settings.get("robust") is not None)
     found = None
     if components is not None:
         from baarda.procedures.variance_components import estimate_components
@@ -81,21 +78,34 @@ def adjust_and_report(
 
         if not chosen.empty or components is not None:
             raise UsageError("--audit evaluates a solution as it stands: no procedure that changes the model goes with it")
-        audited = audit_network(network, options, **settings, progress=None if quiet else progress)
+        audited = audit_network(network, options, **settings, progress=progress)
         result = audited.adjustment
     elif chosen.empty:
         tell = None if quiet else lambda text: typer.echo(text, err=True)
-        result = adjust_network(network, **settings, progress=None if quiet else progress, tell=tell)
+        result = adjust_network(network, **settings, progress=progress, tell=tell)
     else:
         result, strategy = carry_out(network, chosen, options, None if quiet else lambda text: typer.echo(text, err=True), **settings)
-    if not quiet:
-        typer.echo("testing and writing ...", err=True)
-    analysis = replace(analyse(result, options), strategy=strategy, components=found, audit=audited)
-    if result.status == "converged" and points is not None:
+    begins, shown = stage(quiet), out is not None or as_json or not quiet
+    converged = result.status == "converged"
+    if converged and not quiet:
+        typer.echo(first_answer(result), err=True)
+    if converged and shown:  # what the tests and the tables share, computed here so that each stage is told as it begins
+        begins("redundancy numbers and precision")
+        _ = result.evidence, result.point_cofactors
+    if converged:
+        begins("tests and their simulated null laws" if result.law is None else "tests")
+    counted = None if quiet else Counted("data sets simulated")
+    analysis = replace(analyse(result, options, counted), strategy=strategy, components=found, audit=audited)
+    if converged and shown and result.law is None:
+        begins("laws of errors, fitted and simulated")
+        _ = analysis.study
+    if converged and points is not None:
         geojson.write_points(result, points, options.sigma)
-    if result.status == "converged" and covariance is not None:
+    if converged and covariance is not None:
+        begins("covariances of the unknowns")
         covariance_file.write_covariance(result, covariance, sigma=options.sigma)
     if out is not None:
+        begins("tables, figures and report")
         write_folder(analysis, out, tables, {"seconds": round(time.perf_counter() - started, 3)}, spoken, pdf)
     if as_json:
         typer.echo(json.dumps(result_json(analysis), indent=1, allow_nan=False, ensure_ascii=False))

@@ -10,6 +10,7 @@ from typing import Any
 
 import typer
 
+from baarda.cli.progress import Iterations, stage
 from baarda.errors import UsageError
 
 
@@ -28,6 +29,7 @@ def adjust_parts_and_report(
     others: dict[str, Any],
 ) -> None:
     """Adjust the parts, test, write the folder, print verdict or JSON, leave with the exit code."""
+    from baarda.adjustment.solve import Settings
     from baarda.formats.folder import check_target
     from baarda.hypotheses.levels import Options
     from baarda.procedures.helmert import finish, solve_blocked
@@ -52,31 +54,29 @@ def adjust_parts_and_report(
     if out is not None:
         check_target(out, MARK)
 
-    def progress(step: Any) -> None:
-        relative = "" if step.relative_step is None else f"  relative step {step.relative_step:.1e}"
-        damping = f"  damping {step.damping:.0e}" if step.damping else ""
-        taken = "" if step.accepted else "  rejected"
-        typer.echo(f"iteration {step.count:>2}  v'Pv {step.objective:.10g}{relative}{damping}{taken}", err=True)
-
     folder = read_partition(source)
     jobs = settings.pop("jobs", None)
     tell = None if quiet else lambda text: typer.echo(text, err=True)
+    progress, begins = None if quiet else Iterations(started, Settings.tolerance), stage(quiet)
     with open_engine(cluster, jobs, tell=tell) as engine:
         threads = jobs if cluster is None else 1
-        blocked = solve_blocked(folder, engine, progress=None if quiet else progress, tell=tell, **{**settings, "jobs": threads})
-        if not quiet:
-            typer.echo("testing and writing ...", err=True)
+        blocked = solve_blocked(folder, engine, progress=progress, tell=tell, **{**settings, "jobs": threads})
+        if blocked.converged and not quiet:
+            typer.echo(f"adjusted: s0 {blocked.variance_factor**0.5:.4g}, redundancy {blocked.redundancy}", err=True)
 
         def facts() -> dict[str, Any]:
             moved = {"tasks": engine.tasks, "bytes_sent": engine.sent, "bytes_received": engine.received}
             return {"seconds": round(time.perf_counter() - started, 3), "workers": engine.name, **moved}
 
-        if out is None:
-            done = finish(blocked, engine, options)
-        else:
-            done = write_blocked(
-                lambda place, write: finish(blocked, engine, options, place, write), out, str(source), tables, facts, spoken
-            )
+        def finished(place: str | None = None, write: Any = None) -> Any:
+            tables_too = "" if place is None else ", and their tables"
+            begins(f"redundancy numbers, precision and tests of {len(blocked.joint.facts)} parts{tables_too}")
+            made = finish(blocked, engine, options, place, write)
+            if place is not None:
+                begins("figures and report")
+            return made
+
+        done = finished() if out is None else write_blocked(finished, out, str(source), tables, facts, spoken)
     if as_json:
         typer.echo(json.dumps(result_json(done, str(source)), indent=1, allow_nan=False, ensure_ascii=False))
         sys.stdout.flush()

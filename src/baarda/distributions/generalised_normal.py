@@ -60,8 +60,10 @@ class GeneralisedNormal(Distribution):
     @classmethod
     def _score(cls, z: Floats, *shapes: Any) -> Any:
         p = np.asarray(shapes[0], dtype=float)
-        with np.errstate(divide="ignore", over="ignore"):
-            return np.where(z == 0.0, 0.0, -p * np.sign(z) * np.abs(z) ** (p - 1.0))
+        z = np.asarray(z, dtype=float)
+        size = np.where(z == 0.0, 1.0, np.abs(z))  # for p < 1 the power is infinite at the centre, where the score is set to 0
+        with np.errstate(over="ignore"):
+            return -p * np.sign(z) * size ** (p - 1.0)
 
     @classmethod
     def _gradient(cls, z: Floats, *shapes: Any) -> tuple[Floats, ...]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from baarda.discover import members
 from baarda.errors import InputError, UsageError
 from baarda.formats.base import FIRST_PIXEL, Format, regular_size, unreadable
+from baarda.formats.folder import HEADS, is_result
 from baarda.network import Network
 
 __all__ = ["Format", "formats", "read", "recognise", "write"]
@@ -86,6 +87,7 @@ def read(
         If a file cannot be used; the message names file and line.
     """
     where = Path(path)
+    nameable(path)
     if (geoid is not None and crs is None) or (crs is not None and control is None):
         raise UsageError("a geoid belongs to a coordinate system (crs), and that to a table of control points")
     if format is None:
@@ -122,8 +124,28 @@ def read(
     return network
 
 
+def nameable(path: str | Path) -> None:
+    """Refuse a name that is no text: results, tables and reports could not say where they come from.
+
+    Raises
+    ------
+    UsageError
+        If the name of a file or folder is not UTF-8.
+
+    Examples
+    --------
+    >>> nameable("blocks/East 1")
+    """
+    try:
+        str(path).encode("utf-8")
+    except UnicodeEncodeError:
+        raise UsageError(f"{path}: the name is not UTF-8, so that no result could tell it: rename the file or folder") from None
+
+
 def digest(path: Path) -> str:
     """Return the sha256 of a file, or over the sorted relative names, sizes and contents of a folder.
+
+    Result folders of ours within the folder do not count: they come from the source and would change its hash from run to run.
 
     Raises
     ------
@@ -142,8 +164,12 @@ def _digest(path: Path) -> str:
     if path.is_file():
         with path.open("rb") as f:
             return hashlib.file_digest(f, "sha256").hexdigest()
-    for file in sorted(p for p in path.rglob("*") if p.is_file()):
-        name = file.relative_to(path).as_posix().encode()
+    files = [p for p in path.rglob("*") if p.is_file()]
+    results = {p.parent for p in files if p.name in HEADS and p.parent != path and is_result(p.parent)}
+    for file in sorted(files):
+        if results and not results.isdisjoint(file.parents):
+            continue
+        name = file.relative_to(path).as_posix().encode("utf-8", "surrogateescape")
         total.update(len(name).to_bytes(8, "little") + name + file.stat().st_size.to_bytes(8, "little"))
         with file.open("rb") as f:
             while piece := f.read(1 << 20):

@@ -83,6 +83,38 @@ def sigma_range(values: Sequence[float] | Floats, what: str, error: Complaint, s
         raise error(int(row), f"{what} = {float(rows[row, column])!r} does not lie between {smallest:g} and {SIGMAS[1]:g}")
 
 
+#: largest number of a camera that a reader accepts: no lens has more, and squares must not overflow
+LARGEST_OF_CAMERA = 1e12
+
+
+def camera_range(values: Sequence[float] | Floats, what: str, error: Complaint) -> None:
+    """Refuse numbers that no camera has; NaN (missing) is left to the caller.
+
+    Parameters
+    ----------
+    values : (n,) or (n, k) array
+        Parameters of cameras, origins, sizes.
+    what : str
+        Name for the message.
+    error : callable
+        Row to error.
+
+    Raises
+    ------
+    InputError
+        That names the value.
+
+    Examples
+    --------
+    >>> camera_range([0.0, -35.5, 1e-30], "value", lambda row, message: InputError(message))
+    """
+    rows = np.asarray(values, dtype=float).reshape(len(values), -1)
+    bad = np.argwhere(np.abs(rows) > LARGEST_OF_CAMERA)
+    if len(bad):
+        row, column = bad[0]
+        raise error(int(row), f"{what} = {float(rows[row, column])!r} is beyond {LARGEST_OF_CAMERA:g}")
+
+
 def images_with_points(images: Ints, labels: Sequence[str], needed: NDArray[np.bool_], error: Complaint) -> None:
     """Refuse images without image points.
 

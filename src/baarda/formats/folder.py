@@ -12,6 +12,9 @@ from pathlib import Path
 
 from baarda.errors import OutputError, UsageError
 
+HEADS = ("result.json", "batch.json")  # what results begin with
+_PARTS = {*HEADS, "run.json", "report.html", "report.pdf", "tables", "figures", "project", "blocks", "records"}
+
 
 @dataclass(frozen=True)
 class Mark:
@@ -37,6 +40,25 @@ class Mark:
             return False
         with (folder / self.file).open("rb") as f:
             return f'"schema": "{self.schema}'.encode() in f.read(400)
+
+
+def is_result(folder: Path) -> bool:
+    """Return whether a folder is a result folder, of whatever verb, and holds nothing of anybody else.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Returns
+    -------
+    bool
+    """
+    held = {p.name for p in folder.iterdir()}
+    name = "batch.json" if "batch.json" in held else "result.json" if {"run.json", "result.json"} <= held else None
+    if name is None or not held <= _PARTS or not (folder / name).is_file():
+        return False
+    with (folder / name).open("rb") as f:
+        return b'"schema": "baarda.' in f.read(400)
 
 
 def check_target(target: Path, mark: Mark | None = None) -> None:

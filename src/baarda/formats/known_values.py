@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baarda.cameras import FIXED, FREE, OBSERVED, STATES
-from baarda.formats.checks import SIGMAS, sigma_range
+from baarda.formats.checks import SIGMAS, camera_range, sigma_range
 from baarda.formats.csv_table import CsvTable
 from baarda.geometry import rotation as rot
 from baarda.network import AXES, CHECK, CONTROL, EXTERIOR, Network
@@ -149,6 +149,7 @@ def with_unknowns(network: Network, table: CsvTable) -> Network:
     of_camera = np.array([name.startswith("camera ") for name in table.texts("name")])
     for of_kind, smallest in ((of_camera, 1e-60), (~of_camera, SIGMAS[0])):
         sigma_range(np.where(of_kind, sigma, 0.0), "sigma", table.error, smallest)
+    camera_range(np.where(of_camera, value, 0.0), "value", table.error)
     cameras, images, points = network.cameras, network.images, network.points
     labels = {
         "camera": {c.label: i for i, c in enumerate(cameras)},

@@ -112,6 +112,8 @@ def _read_cameras(tables: Mapping[str, Path], header: Header, notes: list[str]) 
     own = [t.model() for t in header.camera_sets]
     known: dict[str, CameraModel] = {}
     grid = table.numbers("grid_half_width")
+    for values, what in ((size, "the pixel size"), (origin, "the origin"), (image, "width or height"), (grid, "grid_half_width")):
+        checks.camera_range(values, what, table.error)
     out = []
     for i, (label, model) in enumerate(zip(index, table.texts("model"), strict=True)):
         if model not in known:
@@ -151,6 +153,8 @@ def _read_parameters(file: Path, cameras: CsvTable, index: Mapping[str, int], ou
     value, given = table.numbers("value", None), table.numbers("given")
     sigma, said = table.sigmas("sigma"), table.choices("state", STATES)
     checks.sigma_range(sigma, "sigma", table.error, smallest=1e-60)
+    checks.camera_range(value, "value", table.error)
+    checks.camera_range(given, "given", table.error)
     # the same rules as for all unknowns, except that a parameter of which nothing is said is fixed
     state = np.where(said >= 0, said, np.where(sigma > 0.0, OBSERVED, FIXED))
     state = np.where((state == OBSERVED) & (sigma == 0.0), FIXED, state)

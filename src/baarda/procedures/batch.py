@@ -25,7 +25,7 @@ from baarda import __version__
 from baarda.adjustment import adjust
 from baarda.errors import BaardaError, NotEnoughMemory, OutputError, UsageError
 from baarda.executors import Failure, Workers, memory_limit
-from baarda.formats import digest, read
+from baarda.formats import digest, nameable, read
 from baarda.hypotheses.levels import Options
 from baarda.network import Network
 from baarda.procedures.strategy import Plan, carry_out
@@ -141,7 +141,7 @@ def sources(patterns: Sequence[str]) -> list[str]:
     Raises
     ------
     UsageError
-        If a pattern matches nothing.
+        If a pattern matches nothing, or a name is not UTF-8.
 
     Examples
     --------
@@ -158,6 +158,7 @@ def sources(patterns: Sequence[str]) -> list[str]:
         if not matched:
             raise UsageError(f"nothing matches {pattern!r}")
         for source in matched:
+            nameable(source)
             found.setdefault(os.path.realpath(source), source)
     return list(found.values())
 

@@ -432,8 +432,10 @@ _READY: list[Experiment] = []
 
 
 def _begin(path: str, settings: dict[str, Any], options: Options, seed: int) -> None:
+    from baarda.executors import end_with_parent
     from baarda.formats import read
 
+    end_with_parent()
     network = read(path)
     _READY.append(Experiment(plan(network, options, "start", **settings), settings, seed))
 

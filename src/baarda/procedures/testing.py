@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -11,13 +12,15 @@ from numpy.typing import NDArray
 
 from baarda.adjustment import Adjustment
 from baarda.adjustment.parameter_hypotheses import Collinearity, collinearity
-from baarda.adjustment.robust import NOT_APPLICABLE
+from baarda.adjustment.robust import ENOUGH, NOT_APPLICABLE, NOT_APRIORI, NOT_CHECKED, NOT_ENOUGH, LawOfErrors
 from baarda.distributions.fitting import Fit
 from baarda.hypotheses import run
+from baarda.hypotheses._simulation import affordable
 from baarda.hypotheses.base import Evidence, TestResult
 from baarda.hypotheses.levels import Options
 from baarda.hypotheses.outliers import TauLaw, external_reliability, mdb, standardised, tau
 from baarda.network import Table
+from baarda.observations import CorrelatedPoints, Direct, Distances
 from baarda.procedures.adjustment_laws import AdjustmentLaws, study_adjustment
 from baarda.procedures.external_reliability import external_effects
 
@@ -46,6 +49,8 @@ class Analysis:
         Variances of groups of observations, estimated before the adjustment.
     audit : Audit or None
         The solution of the source as it stands.
+    not_applicable : mapping of str to str
+        What is not judged under a law of errors, by the name of the test, and why; empty for least squares.
     """
 
     adjustment: Adjustment
@@ -54,6 +59,7 @@ class Analysis:
     strategy: Strategy | None = None
     components: VarianceComponents | None = None
     audit: Audit | None = None
+    not_applicable: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def study(self) -> AdjustmentLaws | None:
@@ -157,13 +163,15 @@ def _present(values: Floats | None) -> Floats:
     return values
 
 
-def analyse(adjustment: Adjustment, options: Options | None = None) -> Analysis:
+def analyse(adjustment: Adjustment, options: Options | None = None, progress: Callable[[int, int], None] | None = None) -> Analysis:
     """Test an adjustment.
 
     Parameters
     ----------
     adjustment : Adjustment
     options : Options, optional
+    progress : callable, optional
+        Called with the numbers of simulated data sets that are done and in all, 0 done first.
 
     Returns
     -------
@@ -173,10 +181,49 @@ def analyse(adjustment: Adjustment, options: Options | None = None) -> Analysis:
     options = Options() if options is None else options
     if adjustment.status != "converged":
         return Analysis(adjustment, options, ())
-    evidence = adjustment.evidence
-    applicable = NOT_APPLICABLE if adjustment.law is not None else {}
-    tests = tuple(t for t in run(evidence, options) if t.name not in applicable)
-    return Analysis(adjustment, options, tests)
+    evidence = adjustment.evidence if progress is None else _counted(adjustment.evidence, options, progress)
+    if adjustment.law is None:
+        return Analysis(adjustment, options, tuple(run(evidence, options)))
+    made = run(evidence, replace(options, replicas=1))  # the tests that simulate are those of residuals: none of them is kept
+    reasons = _reasons(adjustment, adjustment.law, dict.fromkeys(t.name for t in made), options)
+    return Analysis(adjustment, options, tuple(t for t in made if t.name not in reasons), not_applicable=reasons)
+
+
+def _reasons(adjustment: Adjustment, law: LawOfErrors, made: Iterable[str], options: Options) -> dict[str, str]:
+    """Return what is not judged under the law of errors of an adjustment, as far as the network has it, and why."""
+    images, groups = adjustment.evidence.images, adjustment.groups
+    several = images is not None and len(np.unique(images[images >= 0])) > 1
+    control = any(isinstance(g, CorrelatedPoints) or (isinstance(g, Direct) and g.kind == "point") for g in groups)
+    absent = [] if several else ["bartlett_images", "variance_per_image"]
+    absent += [] if control else ["control_points", "control_point"]
+    absent += [] if any(isinstance(g, Distances) for g in groups) else ["vdi_vde_2634"]
+    reasons = {name: why for name, why in NOT_APPLICABLE.items() if name not in absent}
+    for name in made:
+        if name in NOT_APPLICABLE:
+            continue
+        if options.sigma == "apriori":
+            reasons[name] = NOT_APRIORI
+        elif law.resistance == "redescending" and name.startswith("check_"):
+            reasons[name] = NOT_CHECKED
+        elif law.resistance == "redescending" and law.redundancy_share < ENOUGH:
+            reasons[name] = NOT_ENOUGH
+    return reasons
+
+
+def _counted(evidence: Evidence, options: Options, progress: Callable[[int, int], None]) -> Evidence:
+    """Return the evidence with a map from errors to residuals that tells how many data sets have gone through it."""
+    mapped, total, done = evidence.residuals_of, affordable(evidence, options), 0
+    if mapped is None or total == 0:
+        return evidence
+
+    def told(errors: Floats) -> Floats:
+        nonlocal done
+        if done < total:  # tests simulate all of them in one pass; what one of them asks for beyond it is not counted
+            progress(done, total)
+        done += errors.shape[1]
+        return mapped(errors)
+
+    return replace(evidence, residuals_of=told)
 
 
 def test(adjustment: Adjustment, **options: Any) -> list[TestResult]:

@@ -294,11 +294,14 @@ def length_deviations(residuals: ArrayLike, redundancy: ArrayLike, sigmas: Array
 
 
 def lengths_of(analysis: Analysis) -> Lengths | None:
-    """Return the observed distances of an adjustment as test lengths, each without itself; None where there are none."""
+    """Return the observed distances of an adjustment as test lengths, each without itself; None where there are none.
+
+    None, too, under a law of errors: v / r belongs to least squares.
+    """
     a = analysis.adjustment
     points = a.network.points
     parts = [(g, a.offsets[i], a.offsets[i + 1]) for i, g in enumerate(a.groups) if isinstance(g, Distances) and len(g)]
-    if not parts or not analysis.converged:
+    if not parts or not analysis.converged or a.law is not None:
         return None
     r, scale = a.redundancy_numbers, a.scale(analysis.options.sigma)
     found = [length_deviations(a.residuals[i:j], r[i:j], g.sigmas, scale) for g, i, j in parts]

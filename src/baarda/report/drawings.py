@@ -39,7 +39,7 @@ def check_vectors(
     Parameters
     ----------
     points : (n, 3) array
-        All object points, object units; drawn faintly.
+        All object points, object units; drawn faintly, except those without coordinates (NaN).
     at, differences : (m, 3) arrays
         Check points, object units, and adjusted - given, in `told`; NaN where a coordinate was not given.
     labels : sequence of str
@@ -62,6 +62,7 @@ def check_vectors(
     (True, 5.0)
     """
     d = np.nan_to_num(differences)
+    points = points[np.isfinite(points).all(axis=1)]  # a point that was set aside may have no coordinates
     largest = float(max(np.hypot(d[:, 0], d[:, 1]).max(), np.abs(d[:, 2]).max())) or 1.0
     everything = np.concatenate([points, at])[:, :2]
     low, high = everything.min(axis=0), everything.max(axis=0)

@@ -80,6 +80,7 @@ def result_json(analysis: Analysis) -> dict[str, Any]:
         "correlations": [{"a": x, "b": y, "value": r} for x, y, r in a.camera_correlations()] if analysis.converged else [],
         **_collinearity(analysis.collinearity if analysis.converged else None),
         "tests": [_test(t) for t in analysis.tests],
+        "not_applicable": [{"name": name, "reason": reason} for name, reason in analysis.not_applicable.items()],
         "laws": laws_json(analysis.study),
         "law_study": study_json(analysis.study),
         "critical_values": critical_json(analysis.study),
@@ -164,8 +165,9 @@ def _check_points(analysis: Analysis) -> list[dict[str, Any]]:
     family = {label: i for t in analysis.tests_named("check_point") for i, label in enumerate(t.labels)}
     tests = analysis.tests_named("check_point")
     rows: dict[str, dict[str, Any]] = {}
+    judged = ("statistic", "p_value", "rejected")
     for name, point, d, sd in zip(e.names, e.groups, e.values, s, strict=True):
-        row = rows.setdefault(point, {"point": point, "dx": None, "dy": None, "dz": None, "sx": None, "sy": None, "sz": None})
+        row = rows.setdefault(point, {"point": point} | dict.fromkeys((*(f"{k}{x}" for k in "ds" for x in "xyz"), *judged)))
         axis = name[-1].lower()
         row[f"d{axis}"], row[f"s{axis}"] = d, sd
     for point, row in rows.items():

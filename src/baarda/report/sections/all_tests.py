@@ -8,6 +8,7 @@ from baarda.hypotheses.base import TestResult
 from baarda.procedures.testing import Analysis
 from baarda.report.sections._numbers import fixed, plural, probability, significant
 from baarda.report.sections.base import Block, Cell, Column, DataTable, Items, Paragraph, SectionMaker, Tone, say
+from baarda.report.translation import tr
 
 
 def _limits(test: TestResult) -> str:
@@ -49,7 +50,7 @@ def _row(test: TestResult, mark: str) -> tuple[str | Cell, ...]:
 
 
 def _build(analysis: Analysis) -> list[Block] | None:
-    if not analysis.tests:
+    if not analysis.tests and not analysis.not_applicable:
         return None
     notes: dict[str, int] = {}
     rows = []
@@ -58,6 +59,9 @@ def _build(analysis: Analysis) -> list[Block] | None:
         if test.note:
             mark = f" [{notes.setdefault(test.note, len(notes) + 1)}]"
         rows.append(_row(test, mark))
+    for name, reason in analysis.not_applicable.items():
+        mark = f" [{notes.setdefault(tr(reason), len(notes) + 1)}]"
+        rows.append((f"{name.replace('_', ' ')}{mark}", Cell("not applicable", "info"), *[""] * 6))
     columns = (
         Column(
             "test",
@@ -81,6 +85,9 @@ def _build(analysis: Analysis) -> list[Block] | None:
         count=plural(len(analysis.tests), "test"),
         families=families,
     )
+    if analysis.not_applicable:
+        left_out = " {count} not applicable under the law of errors of this adjustment: the notes say why."
+        intro += say(left_out, count=plural(len(analysis.not_applicable), "test is", "tests are"))
     blocks: list[Block] = [Paragraph(intro), DataTable("All tests", columns, tuple(rows))]
     if notes:
         blocks.append(Items("Notes to the tests:", tuple(f"[{i}] {text}" for text, i in notes.items())))

@@ -20,6 +20,7 @@ def _build(analysis: Analysis) -> list[Block] | None:
         return None
     table, r = analysis.observations, analysis.adjustment.redundancy_numbers
     rows, total = [], analysis.adjustment
+    plain = total.law is None  # s0 of a group is a number of least squares
     for s in shares(analysis):
         low, mean = float(r[s.rows].min()), float(r[s.rows].mean())
         bias = table["mdb"][s.rows]
@@ -34,7 +35,7 @@ def _build(analysis: Analysis) -> list[Block] | None:
                 powers(s.unit) or MISSING,
                 significant(s.rms, 3),
                 fixed(s.vpv, 2),
-                fixed(s.sigma0, 3),
+                fixed(s.sigma0, 3) if plain else MISSING,
                 _most(analysis.w[s.rows]),
                 _most(analysis.tau[s.rows]),
                 significant(float(np.nanmedian(bias)), 3) if known else MISSING,

@@ -75,6 +75,8 @@ def _global(analysis: Analysis) -> Iterator[Problem]:
 
 
 def _groups(analysis: Analysis) -> Iterator[Problem]:
+    if analysis.adjustment.law is not None:  # s0 of a group is a number of least squares
+        return
     whole = [s for s in shares(analysis) if not s.component and s.redundancy >= 5.0]
     ranked = sorted(whole, key=lambda s: s.sigma0)
     if len(ranked) >= 2 and ranked[-1].sigma0 > 1.5 * ranked[0].sigma0:

@@ -39,12 +39,18 @@ def _figure(analysis: Analysis, index: int) -> Figure | None:
         columns = int(np.clip(np.sqrt(count / 16.0 * max(size) / min(size)), 6, 24))
         at, mean, number = plots.residual_grid(xy - corner, v, size, columns)
         # n |mean|^2 / s^2 is chi-square with two degrees of freedom where nothing systematic is left.
-        beyond = number * (mean**2 / (v**2).mean(axis=0)).sum(axis=1) > stats.chi2.isf(_LEVEL, 2)
+        # Residuals under a law of errors are not judged.
+        judged = analysis.adjustment.law is None
+        beyond = judged & (number * (mean**2 / (v**2).mean(axis=0)).sum(axis=1) > stats.chi2.isf(_LEVEL, 2))
         svg, arrow = plots.vectors(at + corner, mean, beyond, frame, camera.y_down, name, tr("bold: differs from zero"))
         largest = np.hypot(mean[:, 0], mean[:, 1])
         most = int(np.argmax(np.where(number >= 5, largest, -1.0)))
         caption = say(
             "Mean residual vector (adjusted - observed) of each cell of a grid over the image: {count} image points of all images in "
+            "{cells} cells. Under a law of errors they are not tested. The largest mean of five points or more is {most} px. Neighbouring "
+            "arrows that agree show a systematic error."
+            if not judged
+            else "Mean residual vector (adjusted - observed) of each cell of a grid over the image: {count} image points of all images in "
             "{cells} cells. In {beyond} cells (bold) the mean differs from zero at level {level}; chance alone would show {expected}. "
             "The largest mean of five points or more is {most} px. Neighbouring arrows that agree show a systematic error.",
             count=count,
