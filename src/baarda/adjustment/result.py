@@ -338,8 +338,8 @@ class Adjustment:
         """Everything that tests may ask for.
 
         Under a law of errors only what holds there: residuals, and estimates with a variance factor (covariance factor of the law), so that
-        tests of parameters and of check points are Wald tests. `baarda.adjustment.robust.NOT_APPLICABLE` lists the tests to leave out, `NOT_CHECKED`,
-        `NOT_ENOUGH` and `NOT_APRIORI` say when more are.
+        tests of parameters and of check points are Wald tests. `baarda.adjustment.robust.NOT_APPLICABLE` lists the tests to leave out;
+        `NOT_CHECKED`, `NOT_ENOUGH` and `NOT_APRIORI` say when others are.
         """
         codes = self._codes()
         names = tuple(dict.fromkeys(codes["component"].tolist()))

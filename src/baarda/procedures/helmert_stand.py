@@ -167,8 +167,8 @@ class Part:
             )
         if needed > there:
             raise NotEnoughMemory(
-                f"{what} of part {self.source.number} would take about {needed / 1e9:.3g} GB of memory; {there / 1e9:.3g} GB are available: "
-                "split into more parts"
+                f"{what} of part {self.source.number} would take about {needed / 1e9:.3g} GB of memory; {there / 1e9:.3g} GB are "
+                "available: split into more parts"
             )
 
     def structure_of(self, lin: Linearization) -> Structure:
