@@ -96,11 +96,6 @@ def subtract_square(b: Floats, c: Floats) -> None:
     _call("dsyrk", "U", "T", c.shape[0], b.shape[1], -1.0, b, _leading(b), 1.0, c, _leading(c))
 
 
-def subtract_square_of_rows(b: Floats, c: Floats) -> None:
-    """Subtract b' b from the lower triangle of c."""
-    _call("dsyrk", "U", "N", c.shape[0], b.shape[0], -1.0, b, _leading(b), 1.0, c, _leading(c))
-
-
 def multiply(a: Floats, b: Floats, c: Floats, factor: float = 1.0, keep: float = 0.0) -> None:
     """Set c = factor a b + keep c."""
     _call("dgemm", "N", "N", b.shape[1], a.shape[0], a.shape[1], factor, b, _leading(b), a, _leading(a), keep, c, _leading(c))
