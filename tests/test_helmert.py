@@ -247,6 +247,13 @@ def test_border_against_dense_algebra(damping):
         part = helmert_statistics.PartSolver(solver, q[np.ix_(b, b)])
         rhs = rng.standard_normal((unknowns.count, 2)) * lin.scale[:, None]
         assert np.abs((part.solve(rhs) - q @ rhs) * lin.scale[:, None]).max() < 1e-8
+        t, k, c = rng.standard_normal((unknowns.count, 2)), q @ rhs, np.diag([3.0, 5.0])
+        moved = helmert_statistics.PartCofactors(part, unknowns.count, (t, k, c))
+        expected = q - t @ k.T - k @ t.T + t @ c @ t.T
+        every, mixed = np.arange(unknowns.count), np.abs(t) @ np.abs(k.T)
+        size = np.sqrt(np.outer(np.diag(q), np.diag(q))) + mixed + mixed.T + np.abs(t) @ c @ np.abs(t.T)
+        for got in (moved.solve(np.eye(unknowns.count)), moved.of(every)):
+            assert (np.abs(got - expected) <= 1e-9 * size).all()
 
 
 # ---- refusals -------------------------------------------------------------------------------------------------------------------------
@@ -404,6 +411,11 @@ def test_json_and_strict(project, tmp_path):
         (["--camera", "none"], "--camera do"),
         (["--robust", "student"], "--robust do"),
         (["--tables", "xml"], "--tables is csv or parquet"),
+        (["--snoop-unit", "image"], "--snoop do"),
+        (["--criterion", "bic"], "--criterion do"),
+        (["--components-by", "camera"], "--components-by do"),
+        (["--lever-arm", "0,0,1"], "--lever-arm do"),
+        (["--position-model", "shift"], "--position-model do"),
     ],
 )
 def test_what_does_not_go_with_parts(arguments, message, project, tmp_path):
