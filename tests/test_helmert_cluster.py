@@ -174,7 +174,7 @@ def test_the_limit_of_the_cluster_is_kept(tmp_path, monkeypatch):
     try:
         with (
             open_engine(made.address) as e,
-            pytest.raises(TaskFailed, match=r"part 0 need.* GB of memory; the worker may take 0\.0002 GB") as found,
+            pytest.raises(TaskFailed, match=r"part 0 would take .* GB of memory; the worker may take 0\.0002 GB") as found,
         ):
             solve_blocked(source, e)
         assert found.value.exit_code == NotEnoughMemory.exit_code

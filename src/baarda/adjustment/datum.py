@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -221,6 +221,10 @@ class Datum:
             return None
         g = self.defect.basis
         return np.asarray(np.linalg.solve((self.conditions.T @ g).T, g.T).T)
+
+    def at(self, defect: Defect) -> Datum:
+        """Return the same conditions with the free transformations at another state, where points far away move by other amounts."""
+        return replace(self, defect=defect) if defect.count == self.defect.count else self
 
     def transform(self, x: Floats) -> Floats:
         """Apply S to vectors of unknowns, (u,) or (u, k)."""

@@ -13,20 +13,21 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from baarda.cameras import Optics
+from baarda.cameras import FREE, Optics
 from baarda.errors import BaardaError, Singular, UsageError
 from baarda.geometry.intersection import PointStatus, intersect
 from baarda.geometry.relative_orientation import RelativeOrientation, relative_orientation
 from baarda.geometry.resection import resect
 from baarda.geometry.similarity import similarity
-from baarda.network import Network
-from baarda.observations import ImagePoints
+from baarda.network import Network, State, Viewpoints
+from baarda.observations import ImagePoints, viewpoints_of
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
 
 ENOUGH = 4  # points for a resection
+PARALLEL = 0.1  # root mean square angle of rays to their mean, radians, up to which they may meet almost at infinity
 
 
 def complete(network: Network, aside: Bools) -> tuple[Network, list[str]]:
@@ -58,7 +59,7 @@ def complete(network: Network, aside: Bools) -> tuple[Network, list[str]]:
     missing_images = np.asarray(~(np.isfinite(images.position).all(axis=1) & np.isfinite(images.rotation).all(axis=(1, 2))))
     missing_points = np.asarray(~np.isfinite(points.coordinates).all(axis=1) & ~aside)
     if not (missing_images.any() or missing_points.any()):
-        return network, []
+        return _nearer(network, aside, [])
     search = _Search(network, aside, ~missing_images, ~missing_points & ~aside)
     search.run()
     left = [f"image {images.labels[i]}" for i in np.flatnonzero(~search.oriented)]
@@ -76,7 +77,19 @@ def complete(network: Network, aside: Bools) -> tuple[Network, list[str]]:
         images=replace(images, position=search.position, rotation=search.rotation),
         points=replace(points, coordinates=search.coordinates),
     )
-    return network, notes
+    return _nearer(network, aside, notes)
+
+
+def _nearer(network: Network, aside: Bools, notes: list[str]) -> tuple[Network, list[str]]:
+    """Bring the start values of points almost at infinity to where their distance still counts in the normal equations."""
+    seen, points = viewpoints_of(network.observations, State.of(network)), network.points
+    which = seen.beyond_start(points.coordinates) & (points.states == FREE).all(axis=1) & ~aside
+    if not which.any():
+        return network, notes
+    labels = [points.labels[i] for i in np.flatnonzero(which)]
+    names = ", ".join(labels[:10]) + (", ..." if len(labels) > 10 else "")
+    note = f"start values of {len(labels)} point(s) almost at infinity brought nearer along their rays: {names}"
+    return replace(network, points=replace(points, coordinates=seen.nearer(points.coordinates, which))), [*notes, note]
 
 
 class _Search:
@@ -111,6 +124,8 @@ class _Search:
                 continue
             if self.oriented.all() and (self.known | ~self.seen()).all():
                 return
+            if self.oriented.all() and self.place_far():
+                continue
             if not self.start_model():
                 return
 
@@ -165,6 +180,23 @@ class _Search:
                 self.coordinates[good], self.known[good] = found.points[good], True
                 return True
         return False
+
+    def place_far(self) -> bool:
+        """Place points whose rays are almost parallel, or meet behind the cameras, far out on their mean ray."""
+        rows = np.flatnonzero(~self.known[self.point])
+        rays = np.einsum("nji,nj->ni", self.rotation[self.image[rows]], np.column_stack([self.xy[rows], -np.ones(len(rows))]))
+        rays /= np.linalg.norm(rays, axis=1)[:, None]
+        count = len(self.known)
+        mean = np.stack([np.bincount(self.point[rows], rays[:, k], count) for k in range(3)], axis=1)
+        size = np.linalg.norm(mean, axis=1)
+        number = np.bincount(self.point[rows], minlength=count)
+        parallel = (number >= 2) & (size > np.cos(PARALLEL) * number)
+        seen = Viewpoints.of(self.image[rows], self.point[rows], self.position, count)
+        good = parallel & (seen.base > 0.0)
+        self.coordinates[good] = seen.centres[good] + mean[good]
+        self.coordinates = seen.nearer(self.coordinates, good)
+        self.known |= good
+        return bool(good.any())
 
     def start_model(self) -> bool:
         """Orient a pair of images relatively: in the free network, or as a model that is then moved onto the control."""

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from baarda.adjustment.datum import Datum
+from baarda.adjustment.datum import Datum, find_defect
 from baarda.adjustment.linear_system import Linearization
 from baarda.adjustment.linearize import Arrangement, linearize, whitened_misclosures
 from baarda.adjustment.result import Iteration
 from baarda.adjustment.solver import Solver
 from baarda.errors import Singular
 from baarda.network import Network, State
-from baarda.observations import ImagePoints, Kind
+from baarda.observations import viewpoints_of
 
 if TYPE_CHECKING:
     from baarda.adjustment.solve import Settings
@@ -156,10 +156,11 @@ def iterate(
     control = Control(float(lin.misclosure @ lin.misclosure), lin.count, settings, settings.progress)
     before: Floats | None = None  # the last full step, as a change of the observations
     straight = False  # whether the last step was neither damped nor bent nor lengthened
-    centres, largest = centres_of_rays(groups.groups, state), lin.scale
+    viewpoints, largest = viewpoints_of(groups.groups, state), lin.scale
+    far = bool(viewpoints.far(state.points).any())
 
     def moved(step: Floats) -> State:
-        return state.moved(unknowns, step, centres)
+        return state.moved(unknowns, step, viewpoints)
 
     def linearized(there: State, scale: Floats | None) -> Linearization:
         return replace(linearize(network, there, unknowns, groups, workers), near=scale)
@@ -190,6 +191,8 @@ def iterate(
                     raise
                 before, solver, straight = None, None, False
                 continue
+        if far and datum.transfer is not None:
+            datum = datum.at(find_defect(lin, state))
         step, change = _step(lin, solver, datum, lin.misclosure)
         squares, bent = float(change @ change), False
         relative, lengthened, plain = control.relative(squares), 1.0, straight
@@ -234,18 +237,6 @@ def _step(lin: Linearization, solver: Solver, datum: Datum, y: Floats) -> tuple[
         return step, change
     step = datum.transform(step)
     return step, lin.times(step)  # the free transformations are those of the start values: they change the observations a little
-
-
-def centres_of_rays(groups: Sequence[Kind], state: State) -> Floats:
-    """Return for each point the mean place of the images that see it, NaN where none does."""
-    total, count = np.zeros((len(state.points), 3)), np.zeros(len(state.points))
-    for group in groups:
-        if isinstance(group, ImagePoints):
-            count += np.bincount(group.points, minlength=len(count))
-            for k in range(3):
-                total[:, k] += np.bincount(group.points, state.position[group.images, k], len(count))
-    with np.errstate(invalid="ignore"):
-        return np.asarray(total / count[:, None])
 
 
 def _full_step(lin: Linearization, datum: Datum, factor: Callable[..., Solver]) -> float:

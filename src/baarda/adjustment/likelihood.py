@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from baarda.adjustment.datum import Datum
+from baarda.adjustment.datum import Datum, find_defect
 from baarda.adjustment.linear_system import Linearization
 from baarda.adjustment.linearize import Arrangement, linearize, whitened_misclosures
 from baarda.adjustment.result import Iteration
@@ -17,6 +17,7 @@ from baarda.adjustment.solver import Solver
 from baarda.distributions.base import Distribution
 from baarda.errors import UsageError
 from baarda.network import Network, State
+from baarda.observations import viewpoints_of
 
 if TYPE_CHECKING:
     from baarda.adjustment.solve import Settings
@@ -107,6 +108,8 @@ def iterate(
     history = [Iteration(0, objective, None, 0.0, True)]
     damping, growth, last = 0.0, 2.0, np.inf
     reach = np.full(lin.count, REACH[1])
+    viewpoints = viewpoints_of(groups.groups, state)
+    far = bool(viewpoints.far(state.points).any())
     for count in range(1, settings.iterations + 1):
         u = lin.misclosure / scale
         slope = (law.score(u - reach) - law.score(u + reach)) / (2.0 * reach)
@@ -118,13 +121,15 @@ def iterate(
         step = solver.solve(rhs)
         if damping == 0.0:
             step = _newton_step(lin, solver, slope, u, psi, rhs, step, scale)
+        if far and datum.transfer is not None:
+            datum = datum.at(find_defect(lin, state))
         step = datum.transform(step)
         change = lin.times(step)
         relative = float(np.sqrt(change @ (curvature * change) / r) / scale)
         slope_along = float(step @ rhs) / scale**2
         length, accepted = 1.0, False
         for _ in range(1 if damping > 0.0 else HALVINGS):  # Armijo's rule along Newton's step; the damped step is taken or not
-            trial = state.moved(lin.unknowns, length * step)
+            trial = state.moved(lin.unknowns, length * step, viewpoints)
             v = whitened_misclosures(network, trial, groups, lin.workers)
             value, trial_scale = np.inf, scale
             if np.isfinite(v).all():

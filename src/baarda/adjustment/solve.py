@@ -28,7 +28,7 @@ from baarda.adjustment.structure import analyse, inner_points
 from baarda.cameras import FREE
 from baarda.errors import DatumDefect, RedundancyNotPositive, Singular, UsageError
 from baarda.network import CHECK, Network, State, Unknowns, unknowns_of
-from baarda.observations import ImagePoints, Kind, direct_observations
+from baarda.observations import ImagePoints, Kind, direct_observations, viewpoints_of
 
 Floats = NDArray[np.float64]
 DENSE_LIMIT = 1500
@@ -192,7 +192,8 @@ def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDAr
             return DenseSolver.of(lin, datum.held, damping)
         return BlockSolver.of(lin, structure, datum.held, damping)
 
-    datum = choose_datum(defect, lin, settings, prepared)
+    far = viewpoints_of(groups, start).far(start.points)
+    datum = choose_datum(defect, lin, settings, prepared, far)
     given = [lin]
     del lin  # so that the iteration can let it go
     state, lin, history, converged = iterate(prepared, start, given.pop(), arranged, datum, factor, settings)
@@ -201,7 +202,7 @@ def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDAr
         found = adjust_under_law(prepared, state, lin, arranged, datum, factor, settings, redundancy, history)
         state, lin, history, converged, law = found
         more = [*more, *law.assumptions]
-    datum = choose_datum(find_defect(lin, state) if defect.count else defect, lin, settings, prepared)
+    datum = choose_datum(find_defect(lin, state) if defect.count else defect, lin, settings, prepared, far)
     solver = factor(lin, datum)
     adjusted = state.write_to(prepared).shifted(-shift)
     return Adjustment(
@@ -295,8 +296,17 @@ def active_groups(network: Network, active: NDArray[np.bool_]) -> list[Kind]:
     return groups
 
 
-def choose_datum(defect: Defect, lin: Linearization, settings: Settings, network: Network) -> Datum:
+def choose_datum(defect: Defect, lin: Linearization, settings: Settings, network: Network, far: NDArray[np.bool_] | None = None) -> Datum:
     """Tie down the free transformations as the settings say.
+
+    Parameters
+    ----------
+    defect : Defect
+    lin : Linearization
+    settings : Settings
+    network : Network
+    far : (points,) bool array, optional
+        Points almost at infinity, whose distances would tear at a free network: inner constraints leave them out where the others suffice.
 
     Raises
     ------
@@ -328,7 +338,10 @@ def choose_datum(defect: Defect, lin: Linearization, settings: Settings, network
         names = ", ".join(unknowns.names[i] for i in held)
         return Datum("minimal", defect, held, None, f"Minimal constraints hold {defect.count} unknown(s) at their start values: {names}.")
     on = np.zeros(unknowns.count)
-    candidates = {
+    near = columns if far is None else columns[~far]
+    left_out = 0 if far is None else int((columns[far] >= 0).any(axis=1).sum())
+    candidates = {f"all object points but {left_out} far one(s)": near[near >= 0]} if left_out else {}
+    candidates |= {
         "all object points": columns[columns >= 0],
         "all object points and images": images[images >= 0],
         "all unknowns": np.arange(unknowns.count),  # as of a track over points that are held on one line

@@ -4,6 +4,7 @@ from baarda.network.declared import Declared
 from baarda.network.network import AXES, CHECK, CONTROL, EXTERIOR, ROLES, TIE, Images, Network, Points
 from baarda.network.parameters import State, UnknownGroup, Unknowns, unknowns_of
 from baarda.network.tables import Table
+from baarda.network.viewpoints import Viewpoints
 
 __all__ = [
     "AXES",
@@ -20,5 +21,6 @@ __all__ = [
     "Table",
     "UnknownGroup",
     "Unknowns",
+    "Viewpoints",
     "unknowns_of",
 ]

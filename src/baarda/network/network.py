@@ -232,11 +232,11 @@ class Network:
         )
 
     def centroid(self) -> Floats:
-        """Return the mean of all known object coordinates, rounded to whole units; zero where nothing is known."""
+        """Return the middle (medians) of all known object coordinates, rounded to whole units; zero where nothing is known."""
         known = self.points.coordinates[np.isfinite(self.points.coordinates).all(axis=1)]
         if not len(known):
             known = self.images.position[np.isfinite(self.images.position).all(axis=1)]
-        return np.round(known.mean(axis=0)) + 0.0 if len(known) else np.zeros(3)
+        return np.round(np.median(known, axis=0)) + 0.0 if len(known) else np.zeros(3)
 
     def with_camera_states(self, index: int, states: States) -> Network:
         """Return the network with other states of one camera's parameters."""

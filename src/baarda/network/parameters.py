@@ -13,6 +13,7 @@ from baarda.errors import UsageError
 from baarda.geometry import rotation as rot
 from baarda.network.declared import Declared
 from baarda.network.network import AXES, EXTERIOR, Network
+from baarda.network.viewpoints import Viewpoints
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -233,27 +234,30 @@ class State:
             network.declared,
         )
 
-    def moved(self, unknowns: Unknowns, step: Floats, centres: Floats | None = None) -> State:
+    def moved(self, unknowns: Unknowns, step: Floats, viewpoints: Viewpoints | None = None) -> State:
         """Return the state after a step of the unknowns; rotations turn by increments about the camera axes.
 
         Parameters
         ----------
         unknowns : Unknowns
         step : (u,) array
-        centres : (points, 3) array, optional
-            Places from which the points are seen. The part of a point's step along its ray then changes the inverse of its distance, to
-            which image coordinates are nearly linear: points almost at infinity do not creep (Civera, Davison & Montiel 2008). NaN = by
-            coordinates. To first order nothing changes.
+        viewpoints : Viewpoints, optional
+            From where points are seen, to move those of three unknown coordinates along their rays; None = by coordinates.
         """
         padded = np.append(step, 0.0)  # column -1 takes the zero
         camera = unknowns["camera"]
         flat = padded[camera.columns]
         image = padded[unknowns["image"].columns].reshape(-1, 6)
+        own = unknowns["point"].columns.reshape(-1, 3)
+        points = self.points + padded[own]
+        if viewpoints is not None:
+            whole = (own >= 0).all(axis=1)
+            points[whole] = viewpoints.moved(self.points, padded[own])[whole]
         return State(
             tuple(c + flat[camera.offsets[i] : camera.offsets[i + 1]] for i, c in enumerate(self.cameras)),
             self.position + image[:, :3],
             rot.exp(image[:, 3:]) @ self.rotation if len(image) else self.rotation,
-            self.points + along_rays(self.points, padded[unknowns["point"].columns].reshape(-1, 3), centres),
+            points,
             tuple(d.moved(padded[unknowns[d.kind].columns]) for d in self.declared),
         )
 
@@ -268,24 +272,3 @@ class State:
             points=replace(network.points, coordinates=self.points),
             declared=self.declared,
         )
-
-
-def along_rays(points: Floats, steps: Floats, centres: Floats | None) -> Floats:
-    """Return the steps (n, 3) of points with their part along the ray from a centre taken in inverse distance.
-
-    With s the step along the ray over the distance, the distance is divided by 1 - s; beyond s = 1/2 it goes on in proportion. Steps
-    with |s| below 0.1 are left as they are, so that sums of small steps keep the conditions of a datum.
-
-    Examples
-    --------
-    >>> along_rays(np.array([[10.0, 0.0, 0.0]]), np.array([[2.0, 1.0, 0.0]]), np.zeros((1, 3)))
-    array([[2.5, 1. , 0. ]])
-    """
-    if centres is None:
-        return steps
-    ray = points - centres
-    with np.errstate(divide="ignore", invalid="ignore"):
-        s = np.einsum("ni,ni->n", steps, ray) / np.einsum("ni,ni->n", ray, ray)
-    s = np.where(np.abs(s) > 0.1, s, 0.0)  # false for NaN
-    factor = np.where(s < 0.5, s / (1.0 - np.minimum(s, 0.5)), 4.0 * s - 1.0)
-    return np.asarray(steps + (factor - s)[:, None] * np.where(np.isfinite(ray), ray, 0.0))

@@ -13,6 +13,7 @@ from baarda.observations.image_points import ImagePoints
 from baarda.observations.model_components import ModelHeights, ModelPlan
 from baarda.observations.model_coordinates import ModelCoordinates, Models, models
 from baarda.observations.range_doppler import RangeDoppler, Tracks, tracks
+from baarda.observations.rays import viewpoints_of
 
 __all__ = [
     "Angles",
@@ -44,4 +45,5 @@ __all__ = [
     "stations",
     "strips",
     "tracks",
+    "viewpoints_of",
 ]

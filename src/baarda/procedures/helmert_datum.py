@@ -79,9 +79,10 @@ def choose_datum(parts: Parts, stands: Handles, settings: Settings, at_start: bo
         text = f"Minimal constraints hold {d} unknown(s) at their start values: {names}."
         return JointDatum("minimal", d, held, border, None, np.zeros((0, 0)), text)
     kinds: tuple[str, ...] = ("point",)
-    where = "all object points"
+    far = sum(s.far for s in sums)
+    where = "all object points" + (f" but {far} far one(s)" if far else "")
     if np.linalg.matrix_rank(np.concatenate([s.on_points for s in sums]) @ basis) < d:
-        kinds, where = ("point", "image"), "all object points and images"
+        kinds, where = ("point", "image"), f"{where} and images"
     tie = tasks.Tie(parts.joint.size, basis, kinds, at_start)
     inverse = np.linalg.inv(parts.total(tasks.gram, stands, tie))
     text = f"Free network: {d} inner constraint(s) over {where} tie down {free}."

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from baarda.adjustment.block import BlockSolver
 from baarda.adjustment.datum import products, similarity_directions
-from baarda.adjustment.iteration import centres_of_rays
 from baarda.adjustment.linearize import check_finite, whitened_misclosures
 from baarda.adjustment.solve import Settings
 from baarda.errors import UsageError
 from baarda.network import State
-from baarda.observations import ImageCoordinates, ImagePoints
+from baarda.observations import ImageCoordinates, ImagePoints, viewpoints_of
 from baarda.procedures.helmert_stand import Part, Source, Stand
 
 Floats = NDArray[np.float64]
@@ -133,7 +132,7 @@ def directions(part: Part, state: State, size: float) -> Floats:
 
 
 class DatumSums(NamedTuple):
-    """What the parts add up to find the datum defect, see `baarda.adjustment.datum`: (7, 7) arrays."""
+    """What the parts add up to find the datum defect, see `baarda.adjustment.datum`: (7, 7) arrays, and the number of far points."""
 
     gross: Floats
     net: Floats
@@ -141,6 +140,7 @@ class DatumSums(NamedTuple):
     all_unknowns: Floats
     on_points: Floats
     on_images: Floats
+    far: int
 
 
 def datum_sums(stand: Stand, size: float) -> DatumSums:
@@ -156,6 +156,7 @@ def datum_sums(stand: Stand, size: float) -> DatumSums:
         _triangle(g[part.owned]),
         _triangle(g[_of_kind(part, "point")]),
         _triangle(g[_of_kind(part, "image") & part.owned]),
+        int((part.unknowns["point"].columns.reshape(-1, 3)[part.far] >= 0).any(axis=1).sum()),
     )
 
 
@@ -169,6 +170,8 @@ def _triangle(a: Floats) -> Floats:
 
 def _of_kind(part: Part, kind: str) -> Bools:
     columns = part.unknowns[kind].columns
+    if kind == "point":  # see `baarda.adjustment.solve.choose_datum`
+        columns = columns.reshape(-1, 3)[~part.far]
     out = np.zeros(part.unknowns.count, dtype=bool)
     out[columns[columns >= 0]] = True
     return out
@@ -222,7 +225,12 @@ class Tie:
 def tied(stand: Stand, tie: Tie) -> tuple[Floats, Floats]:
     """Return the basis G (u, d) and the conditions B (u, d) of a part; rows of the border that another part owns are left out of B."""
     part = stand.part
-    g = directions(part, part.start if tie.at_start else stand.state, tie.size) @ tie.basis
+    g = directions(part, part.start if tie.at_start else stand.state, tie.size)
+    if tie.at_start and part.far.any():  # they may have moved as far again
+        far = part.unknowns["point"].columns.reshape(-1, 3)[part.far]
+        far = far[far >= 0]
+        g[far] = directions(part, stand.state, tie.size)[far]
+    g = g @ tie.basis
     on = np.zeros(len(g), dtype=bool)
     for kind in tie.kinds:
         on |= _of_kind(part, kind)
@@ -357,7 +365,7 @@ def bent(step: Step, bend: Step) -> Step:
 
 def _moved(stand: Stand, x: Floats, length: float) -> State:
     part, state = stand.part, stand.state
-    return state.moved(part.unknowns, length * x, centres_of_rays(part.groups, state))
+    return state.moved(part.unknowns, length * x, viewpoints_of(part.groups, state))
 
 
 class Trial(NamedTuple):

@@ -30,7 +30,7 @@ from baarda.errors import InputError, NotEnoughMemory
 from baarda.executors import memory_limit
 from baarda.formats.project import read as read_project
 from baarda.network import Network, State, Unknowns, unknowns_of
-from baarda.observations import Kind
+from baarda.observations import Kind, viewpoints_of
 from baarda.procedures.partition_folder import mismatch
 
 Floats = NDArray[np.float64]
@@ -115,6 +115,7 @@ class Part:
         with_images = np.isin(np.arange(len(self.network.cameras)), self.network.images.cameras)
         self.unknowns: Unknowns = unknowns_of(self.network, ~self.aside, with_images)
         self.start = State.of(self.network)
+        self.far = viewpoints_of(self.groups, self.start).far(self.start.points)
         self.rank = rank_for(self.groups, self.start.points)
         self.arranged = Arrangement.of(self.groups, self.rank, self.network)
         self._structure: Structure | None = None

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from baarda.adjustment import Adjustment
+from baarda.adjustment.far_points import far_points
 from baarda.adjustment.parameter_hypotheses import Collinearity
 from baarda.formats.folder import Mark
 from baarda.hypotheses.base import TestResult
@@ -76,6 +77,7 @@ def result_json(analysis: Analysis) -> dict[str, Any]:
         else {"name": a.law.name, "values": a.law.values, "covariance_factor": a.law.covariance_factor, "resistance": a.law.resistance},
         "assumptions": list(a.assumptions),
         "points_set_aside": [net.points.labels[i] for i in np.flatnonzero(a.aside)],
+        "points_almost_infinite": [net.points.labels[i] for i in far_points(a, used).points] if analysis.converged else [],
         "unknowns": camera + fixed,
         "correlations": [{"a": x, "b": y, "value": r} for x, y, r in a.camera_correlations()] if analysis.converged else [],
         **_collinearity(analysis.collinearity if analysis.converged else None),

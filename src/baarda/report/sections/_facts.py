@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from baarda.adjustment.far_points import far_points
 from baarda.cameras import FIXED
 from baarda.hypotheses.base import TestResult
 from baarda.network import AXES, CONTROL
@@ -176,6 +177,14 @@ def point_sigmas(analysis: Analysis) -> tuple[Any, Floats]:
     """Return the point table and the (n, 3) standard deviations of the points; zero where a coordinate is fixed."""
     table = analysis.adjustment.point_table(analysis.options.sigma)
     return table, np.stack([table[f"s{axis}"] for axis in AXES], axis=1)
+
+
+def almost_infinite(analysis: Analysis) -> NDArray[np.bool_]:
+    """Return which rows of the point table are of points that cannot be told from infinity."""
+    a = analysis.adjustment
+    which = np.zeros(len(a.aside), dtype=bool)
+    which[far_points(a, analysis.options.sigma).points] = True
+    return which[~a.aside]
 
 
 def spatial(sigmas: Floats) -> Floats:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from baarda.procedures.testing import Analysis
 from baarda.report import plots
 from baarda.report.scene import MOST_POINTS
-from baarda.report.sections._facts import point_sigmas, scaling, spatial
+from baarda.report.sections._facts import almost_infinite, point_sigmas, scaling, spatial
 from baarda.report.sections._numbers import finer, plural, significant
 from baarda.report.sections.base import Block, Figure, SectionMaker, say
 
@@ -37,7 +37,7 @@ def _build(analysis: Analysis) -> list[Block] | None:
     svg = plots.plan(
         points[drawn], (whole * factor)[drawn], table["role"][drawn].tolist(), images.position, directions, images.labels, unit, told
     )
-    free = whole[whole > 0.0] * factor
+    free = whole[(whole > 0.0) & ~almost_infinite(analysis)] * factor
     sizes = (
         say(" from {low} to {high} {unit}", low=significant(free.min(), 2), high=significant(free.max(), 2), unit=told) if len(free) else ""
     )

@@ -10,9 +10,9 @@ from scipy import stats
 
 from baarda.network import AXES
 from baarda.procedures.testing import Analysis
-from baarda.report.sections._facts import MOST_ROWS, first, point_sigmas, scaling, spatial
-from baarda.report.sections._numbers import decimals_for, finer, fixed
-from baarda.report.sections.base import Block, Column, DataTable, SectionMaker, say
+from baarda.report.sections._facts import MOST_ROWS, almost_infinite, first, point_sigmas, scaling, spatial
+from baarda.report.sections._numbers import decimals_for, finer, fixed, plural
+from baarda.report.sections.base import Block, Column, DataTable, Paragraph, SectionMaker, say
 
 _WORST = 20
 
@@ -117,12 +117,19 @@ def _build(analysis: Analysis) -> list[Block] | None:
         return None
     table, sigmas = point_sigmas(analysis)
     whole = spatial(sigmas)
-    free = np.flatnonzero(whole > 0.0)
+    infinite = almost_infinite(analysis)
+    free = np.flatnonzero((whole > 0.0) & ~infinite)
     if not len(free):
         return None
-    unit, factor = finer(analysis.adjustment.network.unit, sigmas[sigmas > 0.0])
-    blocks: list[Block] = [_summary(sigmas, np.asarray(table["rays"], dtype=float), unit, factor)]
-    blocks.append(_expanded(analysis, table, sigmas, unit, factor))
+    finite = sigmas[~infinite]
+    unit, factor = finer(analysis.adjustment.network.unit, finite[finite > 0.0])
+    blocks: list[Block] = []
+    if infinite.any():
+        count = plural(int(infinite.sum()), "point cannot be", "points cannot be")
+        blocks.append(Paragraph(say("{count} told from infinity; only the list of all points holds them.", count=count)))
+    blocks.append(_summary(finite, np.asarray(table["rays"], dtype=float)[~infinite], unit, factor))
+    axes = {name: table[name][~infinite] for name in ("ellipse_a", "ellipsoid_a")}
+    blocks.append(_expanded(analysis, axes, finite, unit, factor))
     worst = free[np.argsort(-whole[free], kind="stable")][:_WORST]
     if len(free) > _WORST:
         blocks.append(_table(analysis, table, sigmas, worst, say("The {count} weakest points", count=len(worst))))

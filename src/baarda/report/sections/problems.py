@@ -6,10 +6,12 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from baarda.adjustment.far_points import RESOLVED, far_points
 from baarda.network import CHECK
 from baarda.observations import ImagePoints
 from baarda.procedures.testing import Analysis
 from baarda.report.sections._facts import (
+    almost_infinite,
     bare,
     clusters,
     image_rows,
@@ -210,8 +212,30 @@ def _uncontrolled(analysis: Analysis) -> Iterator[Problem]:
         yield "warn", problem, evidence, advice
 
 
+def _almost_infinite(analysis: Analysis) -> Iterator[Problem]:
+    a = analysis.adjustment
+    found = far_points(a, analysis.options.sigma)
+    if not len(found.points):
+        return
+    shown = []
+    for i, least in zip(found.points, found.least, strict=True):
+        label = a.network.points.labels[i]
+        if np.isfinite(least):
+            label = say("{p} (beyond {d} {unit})", p=label, d=f"{float(f'{least:.2g}'):.12g}", unit=a.network.unit)
+        shown.append(label)
+    problem = say("{count} told from infinity.", count=plural(len(shown), "point cannot be", "points cannot be"))
+    evidence = say("inverse distance within {times:g} of its standard deviations from zero: {names}", times=RESOLVED, names=names(shown, 6))
+    advice = (
+        "Their rays are almost parallel. Like stars they help to orient the images, but their coordinates and sigmas say nothing: leave "
+        "them out of products."
+    )
+    yield "warn", problem, evidence, advice
+
+
 def _behind(analysis: Analysis) -> Iterator[Problem]:
-    found = analysis.adjustment.behind
+    a = analysis.adjustment
+    far = set(a.point_table(analysis.options.sigma)["point"][almost_infinite(analysis)].tolist())
+    found = [(image, point) for image, point in a.behind if point not in far]
     if found:
         yield (
             "bad",
@@ -228,7 +252,7 @@ def _weak_points(analysis: Analysis) -> Iterator[Problem]:
     if free.sum() < 5:
         return
     median = float(np.median(whole[free]))
-    weak = np.flatnonzero(whole > _FAR * median)
+    weak = np.flatnonzero((whole > _FAR * median) & ~almost_infinite(analysis))
     if len(weak):
         weak = weak[np.argsort(-whole[weak], kind="stable")]
         unit, factor = finer(analysis.adjustment.network.unit, whole[free])
@@ -307,8 +331,8 @@ def _law(analysis: Analysis) -> Iterator[Problem]:
 
 
 _CHECKS: tuple[Callable[[Analysis], Iterator[Problem]], ...] = (
-    _global, _gross, _snooped, _gathered, _survey, _behind, _groups, _systematic, _images, _law, _correlated, _superfluous,
-    _uncontrolled, _weak_points, _few_rays, _aside,
+    _global, _gross, _snooped, _gathered, _survey, _behind, _almost_infinite, _groups, _systematic, _images, _law, _correlated,
+    _superfluous, _uncontrolled, _weak_points, _few_rays, _aside,
 )  # fmt: skip
 
 

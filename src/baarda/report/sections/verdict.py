@@ -8,6 +8,7 @@ from scipy import stats
 from baarda.hypotheses.base import TestResult
 from baarda.procedures.testing import Analysis
 from baarda.report.sections._facts import (
+    almost_infinite,
     bare,
     clusters,
     image_rows,
@@ -292,10 +293,12 @@ def _hidden(analysis: Analysis) -> Sentence | None:
 
 def _precision(analysis: Analysis) -> Sentence | None:
     table, sigmas = point_sigmas(analysis)
-    free = (sigmas > 0.0).any(axis=1)
+    infinite = almost_infinite(analysis)
+    free = (sigmas > 0.0).any(axis=1) & ~infinite
     if not free.any():
         return None
     whole = spatial(sigmas)
+    sigmas = sigmas[~infinite]
     weakest = int(np.argmax(np.where(free, whole, -1.0)))
     # Coordinates of one axis may all be fixed, as heights of a network in the plane.
     medians = [float(np.median(s[s > 0.0])) if (s > 0.0).any() else float("nan") for s in sigmas.T]
@@ -314,6 +317,8 @@ def _precision(analysis: Analysis) -> Sentence | None:
         name=table["point"][weakest],
         most=shown[3],
     )
+    if infinite.any():
+        text += " " + say("{count} told from infinity.", count=plural(int(infinite.sum()), "point cannot be", "points cannot be"))
     return Sentence("Precision", text, "info", "points")
 
 

@@ -1,0 +1,65 @@
+"""Points whose rays are so nearly parallel that their distance cannot be told from infinity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from baarda.adjustment.result import Adjustment, Scaling
+from baarda.cameras import FIXED
+from baarda.network import State
+from baarda.observations import ImagePoints, viewpoints_of
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+RESOLVED = 3.0  # standard deviations of its inverse distance that a point must be away from infinity
+ONE_SIDED = 1.6448536269514722  # normal fractile of 95 %
+
+
+@dataclass(frozen=True)
+class FarPoints:
+    """Points that cannot be told from infinity.
+
+    Attributes
+    ----------
+    points : (k,) int array
+        Their numbers in the network.
+    least : (k,) array
+        Limit that their distance from the middle of the images that see them exceeds with a probability of 95 %, object units; infinite
+        where even that lies beyond infinity.
+    """
+
+    points: Ints
+    least: Floats
+
+
+def far_points(a: Adjustment, sigma: Scaling) -> FarPoints:
+    """Return the points whose inverse distance from their images is less than 3 of its standard deviations.
+
+    Image coordinates are nearly linear in the inverse distance rho = 1/r, which may come out negative: the rays open, the point stands
+    behind its images. Its standard deviation is sigma_r / r^2, so that the ratio is r / sigma_r.
+
+    Parameters
+    ----------
+    a : Adjustment
+    sigma : {"aposteriori", "apriori"}
+        The variance factor of the standard deviations.
+    """
+    network, state = a.network, State.of(a.network)
+    own = np.flatnonzero((network.points.states != FIXED).all(axis=1) & ~a.aside)
+    seen = viewpoints_of(a.groups, state)
+    own = own[seen.base[own] > 0.0]
+    ray = state.points[own] - seen.centres[own]
+    r = np.linalg.norm(ray, axis=1)
+    deviation = a.scale(sigma) * np.sqrt(np.einsum("ni,nij,nj->n", ray, a.point_cofactors[own], ray)) / r
+    weak = np.flatnonzero(r < RESOLVED * deviation)
+    own, r, deviation = own[weak], r[weak], deviation[weak]
+    front = np.zeros(len(network.points.labels))  # rays with the point in front of the camera, less the others
+    for group in a.groups if len(own) else ():
+        if isinstance(group, ImagePoints):
+            front += np.bincount(group.points, np.where(group.in_front(network, state), 1.0, -1.0), len(front))
+    nearest = np.where(front[own] < 0.0, -1.0, 1.0) / r + ONE_SIDED * deviation / r**2
+    return FarPoints(own, np.where(nearest > 0.0, 1.0 / np.where(nearest > 0.0, nearest, 1.0), np.inf))

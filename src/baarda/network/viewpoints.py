@@ -1,0 +1,111 @@
+"""From where each object point is seen, and how a point moves along its rays, to infinity and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+Bools = NDArray[np.bool_]
+
+FAR = 100.0  # times the base of its rays: beyond, a point's image coordinates are linear in the inverse of its distance
+FARTHEST = 1e9  # times the base: as near as a point comes to infinity on its way
+START = 1e4  # times the base: beyond, the distance hardly counts in 16 digits of a normal equation
+SMALL = 0.1  # part of its distance by which a near point moves straight
+
+
+@dataclass(frozen=True)
+class Viewpoints:
+    """From where points are seen.
+
+    Attributes
+    ----------
+    centres : (points, 3) array
+        Mean place of the images that see a point, object units; NaN where none does.
+    base : (points,) array
+        Their root mean square distance from it.
+    """
+
+    centres: Floats
+    base: Floats
+
+    @staticmethod
+    def of(images: Ints, points: Ints, position: Floats, count: int) -> Viewpoints:
+        """Gather the viewpoints of `count` points from the images and points of (n,) rays and the positions (images, 3).
+
+        Examples
+        --------
+        >>> Viewpoints.of(np.array([0, 1]), np.array([0, 0]), np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), 1).base
+        array([1.])
+        """
+        rays = np.bincount(points, minlength=count)
+        with np.errstate(invalid="ignore"):
+            total = [np.bincount(points, position[images, k], count) for k in range(3)]
+            centres = np.stack(total, axis=1) / rays[:, None]
+            off = ((position[images] - centres[points]) ** 2).sum(axis=1)
+            return Viewpoints(centres, np.sqrt(np.bincount(points, off, count) / rays))
+
+    def far(self, points: Floats) -> Bools:
+        """Return which points (n, 3) are so far that only their directions and inverse distances have nearly normal errors."""
+        return self._beyond(points, FAR)
+
+    def beyond_start(self, points: Floats) -> Bools:
+        """Return which points (n, 3) are too far for a start: see `nearer`."""
+        return self._beyond(points, START)
+
+    def _beyond(self, points: Floats, limit: float) -> Bools:
+        with np.errstate(invalid="ignore"):
+            return np.asarray((np.linalg.norm(points - self.centres, axis=1) > limit * self.base) & (self.base > 0.0))
+
+    def nearer(self, points: Floats, which: Bools) -> Floats:
+        """Return points (n, 3), some of them brought along their mean ray to 10 000 times the base.
+
+        Examples
+        --------
+        >>> seen = Viewpoints(np.zeros((1, 3)), np.array([2.0]))
+        >>> seen.nearer(np.array([[0.0, 0.0, 1e9]]), np.array([True]))
+        array([[    0.,     0., 20000.]])
+        """
+        out = np.array(points)
+        ray = points[which] - self.centres[which]
+        out[which] = self.centres[which] + ray * (START * self.base[which] / np.linalg.norm(ray, axis=1))[:, None]
+        return out
+
+    def moved(self, points: Floats, steps: Floats) -> Floats:
+        """Return where points (n, 3) come by their steps, the part along the ray taken in inverse distance.
+
+        Image coordinates are nearly linear in the inverse of the distance, so that points almost at infinity do not creep (Civera, Davison
+        & Montiel 2008). With s the step along the ray over the distance, the distance is divided by 1 - s; beyond s = 1/2 a near point
+        goes on in proportion. A far one turns by its step and may pass infinity, to come back from behind: its direction stays, and what
+        its rays say is only that their bundle opens. Steps of near points with |s| below 0.1 are left as they are, so that sums of small
+        steps keep the conditions of a datum. To first order nothing changes.
+
+        Examples
+        --------
+        >>> seen = Viewpoints(np.zeros((3, 3)), np.array([1.0, 0.01, 0.01]))
+        >>> seen.moved(np.full((3, 3), [10.0, 0.0, 0.0]), np.array([[2.0, 1.0, 0.0], [2.0, 1.0, 0.0], [20.0, 0.0, 0.0]]))
+        array([[ 12.5 ,   1.  ,   0.  ],
+               [ 12.5 ,   1.25,   0.  ],
+               [-10.  ,   0.  ,   0.  ]])
+        """
+        ray = points - self.centres
+        with np.errstate(divide="ignore", invalid="ignore"):
+            square = np.einsum("ni,ni->n", ray, ray)
+            s = np.einsum("ni,ni->n", steps, ray) / square
+            before = self.base / np.sqrt(square)  # the inverse distance in inverse bases, and that after the step
+            after = before * (1.0 - s)
+        far = (before > 0.0) & (before < 1.0 / FAR) & (after > -1.0 / FAR)
+        out = points + steps
+        at = np.flatnonzero(~far & (np.abs(s) > SMALL))
+        near = s[at]
+        longer = np.where(near < 0.5, near / (1.0 - np.minimum(near, 0.5)), 4.0 * near - 1.0)
+        out[at] += (longer - near)[:, None] * ray[at]
+        at = np.flatnonzero(far)
+        least = 1.0 / FARTHEST
+        longer = before[at] / np.where(np.abs(after[at]) < least, np.copysign(least, after[at]), after[at]) - 1.0
+        across = steps[at] - s[at, None] * ray[at]
+        out[at] = points[at] + longer[:, None] * ray[at] + (1.0 + longer)[:, None] * across
+        return out

@@ -1,0 +1,191 @@
+"""Points almost at infinity: they neither stall nor stop an adjustment, wherever they start, and are named where they say nothing."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from typer.testing import CliRunner
+
+import baarda
+from baarda.adjustment.far_points import far_points
+from baarda.adjustment.linearize import whitened_misclosures
+from baarda.adjustment.solve import active_groups
+from baarda.cameras import FIXED, FREE
+from baarda.cli import app
+from baarda.formats import project
+from baarda.network import Network, State, Viewpoints, unknowns_of
+from baarda.observations import viewpoints_of
+from baarda.procedures.helmert import solve_blocked
+from baarda.procedures.partition_folder import write_partition
+from baarda.procedures.synthetic import synthetic
+from baarda.procedures.task_engines import open_engine
+
+COUNT = 4
+
+
+def far_network(factor: float, images: int = 9, points: int = 120, wrong: float = 0.3, noise: float = 0.5, **options: Any) -> Any:
+    """Return a block with some points moved to a multiple of their distance, badly started, the true network, and the points."""
+    made = synthetic("aerial", images, points=points, seed=4, noise=noise, **options)
+    net, truth, rng = made.network, made.truth, np.random.default_rng(8)
+    group = net.observations[0]
+    rays = np.bincount(group.points, minlength=len(net.points.labels))
+    chosen = rng.choice(np.flatnonzero((rays >= 3) & (net.points.roles == 0)), COUNT, replace=False)
+    seen = viewpoints_of(truth.observations, State.of(truth))
+    true, start = np.array(truth.points.coordinates), np.array(net.points.coordinates)
+    for p in chosen:
+        true[p] = seen.centres[p] + factor * (true[p] - seen.centres[p])
+        start[p] = seen.centres[p] + factor * np.exp(wrong * rng.standard_normal()) * (start[p] - seen.centres[p])
+    truth = replace(truth, points=replace(truth.points, coordinates=true))
+    exact = truth.observations[0]
+    xy = np.array(group.xy)
+    rows = np.isin(group.points, chosen)
+    xy[rows] = (exact.xy - exact.misclosures(truth, State.of(truth)))[rows] + noise * rng.standard_normal((rows.sum(), 2))
+    points = replace(net.points, coordinates=start)
+    return replace(net, points=points, observations=(replace(group, xy=xy), *net.observations[1:])), truth, chosen
+
+
+def by_inverse_distance(network: Network, chosen: Any) -> tuple[float, Any]:
+    """Return the least v'Pv, and the inverse distances of some points over their sigmas, found with directions and inverse distances."""
+    groups, state = active_groups(network, np.ones(len(network.points.labels), dtype=bool)), State.of(network)
+    unknowns = unknowns_of(network, np.ones(len(network.points.labels), dtype=bool), np.ones(len(network.cameras), dtype=bool))
+    columns = unknowns["point"].columns.reshape(-1, 3)[chosen]
+    seen = viewpoints_of(groups, state)
+    centre = seen.centres[chosen]
+    ray = state.points[chosen] - centre
+    ray /= np.linalg.norm(ray, axis=1)[:, None]
+    across = np.cross(ray, np.eye(3)[np.argmin(np.abs(ray), axis=1)])
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    third = np.cross(ray, across)
+
+    def residuals(x: Any) -> Any:
+        there = state.moved(unknowns, np.where(np.isin(np.arange(len(x)), columns), 0.0, x))
+        a, b, rho = x[columns].T * np.array([1e-3, 1e-3, 1e-3])[:, None]
+        direction = ray + a[:, None] * across + b[:, None] * third
+        points = np.array(there.points)
+        points[chosen] = centre + direction / rho[:, None]
+        return whitened_misclosures(network, replace(there, points=points), groups)
+
+    x = np.zeros(unknowns.count)
+    x[columns[:, 2]] = 1e3 / np.linalg.norm(state.points[chosen] - centre, axis=1)
+    found = least_squares(residuals, x, method="lm", x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    cofactor = np.linalg.inv(found.jac.T @ found.jac)
+    return 2.0 * found.cost, found.x[columns[:, 2]] / np.sqrt(np.diag(cofactor)[columns[:, 2]])
+
+
+@pytest.mark.parametrize("solver", ["dense", "block"])
+@pytest.mark.parametrize("factor", [1.0, 30.0, 1e3, 1e5, 1e8, 1e12])
+def test_any_distance_is_adjusted_in_a_few_iterations(solver: str, factor: float) -> None:
+    network, _, chosen = far_network(factor)
+    found = baarda.adjust(network, solver=solver)
+    assert found.status == "converged" and len(found.history) <= 11
+    assert 0.7 < found.variance_factor < 1.3
+    np.testing.assert_allclose(found.redundancy_numbers.sum(), found.redundancy, rtol=1e-6)
+    far = far_points(found, "apriori")
+    assert set(far.points) == (set(chosen.tolist()) if factor >= 1e3 else set())
+    assert (far.least > 3e4).all()  # flying height 1100 m
+
+
+def test_the_minimum_is_that_of_directions_and_inverse_distances() -> None:
+    """Against MINPACK with inverse distances as unknowns: the same v'Pv, and the same inverse distances in units of their sigmas."""
+    network, _, chosen = far_network(2e3, images=4, points=40, wrong=0.1)
+    found = baarda.adjust(network, solver="dense")
+    network = replace(network, points=replace(network.points, coordinates=found.start.points.coordinates))
+    objective, ratio = by_inverse_distance(network, chosen)
+    np.testing.assert_allclose(found.objective, objective, rtol=1e-8)
+    seen = viewpoints_of(found.groups, State.of(found.network))
+    ray = (found.network.points.coordinates - seen.centres)[chosen]
+    square = np.einsum("ni,nij,nj->n", ray, found.point_cofactors[chosen], ray)
+    np.testing.assert_allclose((ray**2).sum(axis=1) / np.sqrt(square), np.abs(ratio), rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("factor", [1e2, 1e4, 1e8])
+def test_a_free_network_does_not_hang_on_far_points(factor: float) -> None:
+    """Inner constraints leave far points out: the sigmas of the others are hardly those of the network without them."""
+    network, _, chosen = far_network(factor, control=0)
+    found = [baarda.adjust(network, solver=s) for s in ("dense", "block")]
+    assert all(f.status == "converged" and len(f.history) < 14 for f in found)
+    assert f"but {COUNT} far one(s)" in found[0].datum.text
+    others = np.setdiff1d(np.arange(len(network.points.labels)), chosen)
+    sigma = [np.sqrt(np.einsum("nii->n", f.point_cofactors[others])) for f in found]
+    np.testing.assert_allclose(sigma[0], sigma[1], rtol=1e-6)
+    group = network.observations[0]
+    rest = replace(network, observations=(group.selected(~np.isin(group.points, chosen)), *network.observations[1:]))
+    alone = baarda.adjust(rest, solver="dense")
+    ratio = np.median(sigma[0] / np.sqrt(np.einsum("nii->n", alone.point_cofactors[others])))
+    assert 0.9 < ratio < 1.0  # like stars they fix the rotations, and nothing else
+
+
+def test_parts_agree_with_the_whole(tmp_path: Any) -> None:
+    network, _, _ = far_network(1e6, images=16, points=300, control=0)
+    whole = baarda.adjust(network, solver="block")
+    with open_engine() as engine:
+        parts = solve_blocked(write_partition(network, 2, tmp_path / "parts"), engine)
+    assert parts.converged and parts.datum.text == whole.datum.text
+    assert parts.objective == pytest.approx(whole.objective, rel=1e-10)
+
+
+@pytest.mark.parametrize("law", ["huber", "student"])
+def test_robust_laws_follow(law: str) -> None:
+    network, _, chosen = far_network(1e6)
+    found = baarda.adjust(network, robust=law)
+    assert found.status == "converged"
+    assert set(far_points(found, "apriori").points) == set(chosen.tolist())
+
+
+@pytest.mark.parametrize("factor", [1e2, 1e4, 1e9])
+def test_start_values_are_found_for_rays_that_open(factor: float) -> None:
+    network, _, chosen = far_network(factor)
+    unknown = np.array(network.points.coordinates)
+    unknown[chosen] = np.nan
+    found = baarda.adjust(replace(network, points=replace(network.points, coordinates=unknown)))
+    assert found.status == "converged"
+    assert found.objective == pytest.approx(baarda.adjust(network).objective, rel=1e-9)
+
+
+def test_fixed_coordinates_stay_where_they_are() -> None:
+    """A point is moved along its ray only if all of its coordinates are unknown."""
+    made = synthetic("aerial", 9, points=120, seed=4).network
+    states, start = np.array(made.points.states), np.array(made.points.coordinates)
+    chosen = np.flatnonzero((states == FREE).all(axis=1))[:5]
+    states[chosen, 2] = FIXED
+    start[chosen, :2] += 400.0
+    found = baarda.adjust(replace(made, points=replace(made.points, states=states, coordinates=start)), iterations=3)
+    np.testing.assert_array_equal(found.network.points.coordinates[chosen, 2], start[chosen, 2])
+
+
+def test_steps_that_are_zero_move_nothing() -> None:
+    points = np.random.default_rng(1).normal(0.0, 1e5, (50, 3))
+    seen = Viewpoints(np.full((50, 3), 0.1), np.ones(50))
+    np.testing.assert_array_equal(seen.moved(points, np.zeros((50, 3))), points)
+
+
+def test_a_step_of_the_inverse_distance_arrives_exactly() -> None:
+    """The linear step of a far point to another direction and inverse distance leads there, through infinity as well."""
+    rng = np.random.default_rng(2)
+    ray = rng.normal(size=(40, 3))
+    ray /= np.linalg.norm(ray, axis=1)[:, None]
+    before, after = 10.0 ** rng.uniform(-9, -2.1, 40), rng.choice([-1.0, 1.0], 40) * 10.0 ** rng.uniform(-8, -2.1, 40)
+    turn = np.cross(ray, 1e-3 * rng.normal(size=(40, 3)))
+    points = ray / before[:, None]
+    steps = turn / before[:, None] - points * ((after - before) / before)[:, None]
+    moved = Viewpoints(np.zeros((40, 3)), np.ones(40)).moved(points, steps)
+    np.testing.assert_allclose(moved, (ray + turn) / after[:, None], rtol=1e-6)
+
+
+def test_the_report_names_them(tmp_path: Any) -> None:
+    network, _, chosen = far_network(1e6)
+    project.write(network, tmp_path / "block")
+    done = CliRunner().invoke(app, ["adjust", str(tmp_path / "block"), "--out", str(tmp_path / "out"), "--format", "project"])
+    assert done.exit_code == 0, done.output
+    labels = [network.points.labels[i] for i in np.sort(chosen)]
+    document = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
+    assert document["points_almost_infinite"] == labels
+    assert any("brought nearer along their rays" in text for text in document["assumptions"])
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert f"{COUNT} points cannot be told from infinity." in page and f"{labels[0]} (beyond " in page
+    assert "behind its camera" not in page
