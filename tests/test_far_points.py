@@ -28,10 +28,10 @@ from baarda.procedures.task_engines import open_engine
 COUNT = 4
 
 
-def far_network(factor: float, images: int = 9, points: int = 120, wrong: float = 0.3, noise: float = 0.5, **options: Any) -> Any:
+def far_network(factor: float, images: int = 9, points: int = 120, wrong: float = 0.3, seed: int = 4, **options: Any) -> Any:
     """Return a block with some points moved to a multiple of their distance, badly started, the true network, and the points."""
-    made = synthetic("aerial", images, points=points, seed=4, noise=noise, **options)
-    net, truth, rng = made.network, made.truth, np.random.default_rng(8)
+    made = synthetic("aerial", images, points=points, seed=seed, **options)
+    net, truth, rng = made.network, made.truth, np.random.default_rng(seed)
     group = net.observations[0]
     rays = np.bincount(group.points, minlength=len(net.points.labels))
     chosen = rng.choice(np.flatnonzero((rays >= 3) & (net.points.roles == 0)), COUNT, replace=False)
@@ -44,7 +44,7 @@ def far_network(factor: float, images: int = 9, points: int = 120, wrong: float 
     exact = truth.observations[0]
     xy = np.array(group.xy)
     rows = np.isin(group.points, chosen)
-    xy[rows] = (exact.xy - exact.misclosures(truth, State.of(truth)))[rows] + noise * rng.standard_normal((rows.sum(), 2))
+    xy[rows] = (exact.xy - exact.misclosures(truth, State.of(truth)))[rows] + 0.5 * rng.standard_normal((rows.sum(), 2))
     points = replace(net.points, coordinates=start)
     return replace(net, points=points, observations=(replace(group, xy=xy), *net.observations[1:])), truth, chosen
 
