@@ -1,7 +1,7 @@
 """The loops over object points as they are compiled; `baarda.adjustment.kernels` chooses between them and their NumPy twins.
 
-No array is sliced inside a loop over row blocks: every view counts a reference, and threads would wait for each other's counts. Unsigned
-places spare the test for negative indices.
+No array is sliced inside a loop over row blocks, and small functions become part of those that call them: every view and every argument
+of a true call counts a reference, and threads would wait for each other's counts. Unsigned places spare the test for negative indices.
 """
 
 from __future__ import annotations
@@ -18,7 +18,51 @@ Ints = NDArray[np.intp]
 Small = NDArray[np.int32]
 
 SMALLEST = 1e-12  # a column of G that others explain to this share is not determined
+SLAB = 96  # rows of Y that stay in the cache while they are squared
 AGAIN = 0.1  # a column of which less than this share is left is orthogonalised once more
+
+
+def _sweep(q: Floats, first: int, end: int, b0: float, b1: float, b2: float) -> tuple[float, float, float, float, float, float, bool]:
+    """Make three columns of q with these squared lengths orthonormal, rows `first` ... `end` - 1, by modified Gram-Schmidt.
+
+    Returns R, row by row, and whether no column is explained by those before it; the length of one that is counts as 1.
+    """
+    regular = b0 > 0.0
+    s00 = np.sqrt(b0) if regular else 1.0
+    f = 1.0 / s00
+    s01 = s02 = 0.0
+    for k in range(first, end):
+        x = q[k, 0] * f
+        q[k, 0] = x
+        s01 += x * q[k, 1]
+        s02 += x * q[k, 2]
+    left = 0.0
+    for k in range(first, end):
+        y = q[k, 1] - s01 * q[k, 0]
+        q[k, 1] = y
+        q[k, 2] -= s02 * q[k, 0]
+        left += y * y
+    s11 = np.sqrt(left)
+    if not s11 > SMALLEST * np.sqrt(b1):
+        regular, s11 = False, 1.0
+    f = 1.0 / s11
+    s12 = 0.0
+    for k in range(first, end):
+        y = q[k, 1] * f
+        q[k, 1] = y
+        s12 += y * q[k, 2]
+    left = 0.0
+    for k in range(first, end):
+        z = q[k, 2] - s12 * q[k, 1]
+        q[k, 2] = z
+        left += z * z
+    s22 = np.sqrt(left)
+    if not s22 > SMALLEST * np.sqrt(b2):
+        regular, s22 = False, 1.0
+    f = 1.0 / s22
+    for k in range(first, end):
+        q[k, 2] *= f
+    return s00, s01, s02, s11, s12, s22, regular
 
 
 def _factor_point(
@@ -27,7 +71,7 @@ def _factor_point(
 ) -> int:  # fmt: skip
     """Fill q from row `first` with the orthogonal factor of a point's rows, and r[place] with the triangular one.
 
-    Returns the number of rows, negative if the point is not determined. Modified Gram-Schmidt, done twice where a column loses much.
+    Returns the number of rows, negative if the point is not determined. A second sweep follows where a column loses much in the first.
     """
     i0, i1, i2 = point_inverse[p, 0], point_inverse[p, 1], point_inverse[p, 2]
     n = first
@@ -52,62 +96,17 @@ def _factor_point(
             b1 += own * own if a == 1 else 0.0
             b2 += own * own if a == 2 else 0.0
             n += 1
-    singular = False
-    r00 = r11 = r22 = 1.0
-    r01 = r02 = r12 = 0.0
-    for sweep in range(2):
-        s00 = np.sqrt(b0)
-        if not s00 > 0.0:
-            singular = True
-            s00 = 1.0
-        f = 1.0 / s00
-        s01 = s02 = 0.0
-        for k in range(first, n):
-            x = q[k, 0] * f
-            q[k, 0] = x
-            s01 += x * q[k, 1]
-            s02 += x * q[k, 2]
-        left = 0.0
-        for k in range(first, n):
-            y = q[k, 1] - s01 * q[k, 0]
-            q[k, 1] = y
-            q[k, 2] -= s02 * q[k, 0]
-            left += y * y
-        s11 = np.sqrt(left)
-        if not s11 > SMALLEST * np.sqrt(b1):
-            singular = True
-            s11 = 1.0
-        f = 1.0 / s11
-        s12 = 0.0
-        for k in range(first, n):
-            y = q[k, 1] * f
-            q[k, 1] = y
-            s12 += y * q[k, 2]
-        left = 0.0
-        for k in range(first, n):
-            z = q[k, 2] - s12 * q[k, 1]
-            q[k, 2] = z
-            left += z * z
-        s22 = np.sqrt(left)
-        if not s22 > SMALLEST * np.sqrt(b2):
-            singular = True
-            s22 = 1.0
-        f = 1.0 / s22
-        for k in range(first, n):
-            q[k, 2] *= f
-        if sweep == 0:
-            r00, r01, r02, r11, r12, r22 = s00, s01, s02, s11, s12, s22
-            if s11 > AGAIN * np.sqrt(b1) and s22 > AGAIN * np.sqrt(b2):
-                break
-            b0 = b1 = b2 = 1.0
-        else:  # R = S R
-            r02 = s00 * r02 + s01 * r12 + s02 * r22
-            r01 = s00 * r01 + s01 * r11
-            r12 = s11 * r12 + s12 * r22
-            r00, r11, r22 = s00 * r00, s11 * r11, s22 * r22
+    r00, r01, r02, r11, r12, r22, regular = _sweep(q, first, n, b0, b1, b2)
+    if not (r11 > AGAIN * np.sqrt(b1) and r22 > AGAIN * np.sqrt(b2)):
+        s00, s01, s02, s11, s12, s22, again = _sweep(q, first, n, 1.0, 1.0, 1.0)
+        regular = regular and again
+        r02 = s00 * r02 + s01 * r12 + s02 * r22  # R = S R
+        r01 = s00 * r01 + s01 * r11
+        r12 = s11 * r12 + s12 * r22
+        r00, r11, r22 = s00 * r00, s11 * r11, s22 * r22
     r[place, 0, 0], r[place, 0, 1], r[place, 0, 2] = r00, r01, r02
     r[place, 1, 1], r[place, 1, 2], r[place, 2, 2] = r11, r12, r22
-    return first - n if singular else n - first
+    return n - first if regular else first - n
 
 
 def _lines(
@@ -190,28 +189,141 @@ def _touch(stack: Ints, touched: int, begins: Ints, count: int) -> int:
     return touched
 
 
+def _parts(table: Ints, starts: Small, k: int, row: int, parts: Ints) -> int:
+    """Fill `parts` with the nodes of a block of chunk k: where each begins in the cluster, its width, and where its partials begin.
+
+    Returned is how many numbers that are.
+    """
+    count, first = 0, table[k, 3] + row * table[k, 1]
+    for j in range(table[k, 1]):
+        s = starts[first + j]
+        if table[k, HEAD + 2 + 3 * j] != 0 and s >= 0:
+            w = table[k, HEAD + 1 + 3 * j]
+            parts[count], parts[count + 1], parts[count + 2] = s, w, table[k, HEAD + 3 * j] + row * table[k, 0] * w
+            count += 3
+    return count
+
+
+def _add_y(
+    values: Floats, upper: int, lower: int, w: int, q: Floats, n: int, n2: int, factor: float, y: Floats, to: int, stride: int
+) -> None:
+    """Add Q'H of two rows of a node to three rows of Y."""
+    a0, a1, a2 = q[n, 0], q[n, 1], q[n, 2]
+    b0, b1, b2 = q[n2, 0] * factor, q[n2, 1] * factor, q[n2, 2] * factor
+    h, h2, t0 = np.uint64(upper), np.uint64(lower), np.uint64(to)
+    t1 = t0 + np.uint64(stride)
+    t2 = t1 + np.uint64(stride)
+    if w == 6:
+        for x in range(np.uint64(6)):
+            u, v = values[h + x], values[h2 + x]
+            y[t0 + x] += a0 * u + b0 * v
+            y[t1 + x] += a1 * u + b1 * v
+            y[t2 + x] += a2 * u + b2 * v
+    else:
+        for x in range(np.uint64(w)):
+            u, v = values[h + x], values[h2 + x]
+            y[t0 + x] += a0 * u + b0 * v
+            y[t1 + x] += a1 * u + b1 * v
+            y[t2 + x] += a2 * u + b2 * v
+
+
+def _six(values: Floats, h: Any) -> tuple[float, float, float, float, float, float]:
+    one = np.uint64(1)
+    h1 = h + one
+    h2 = h1 + one
+    h3 = h2 + one
+    h4 = h3 + one
+    return values[h], values[h1], values[h2], values[h3], values[h4], values[h4 + one]
+
+
+def _add_square(values: Floats, upper: int, lower: int, w: int, factor: float, own: Floats, to: int, stride: int) -> None:
+    """Add H'H of two rows of a node to the lower triangle of its place in a cluster."""
+    h, h2, t = np.uint64(upper), np.uint64(lower), np.uint64(to)
+    if w == 6:  # an exterior orientation: held in registers
+        u, v = _six(values, h), _six(values, h2)
+        for x in range(6):
+            f, g = u[x], v[x] * factor
+            for x2 in range(x + 1):
+                own[t + np.uint64(x2)] += f * u[x2] + g * v[x2]
+            t += np.uint64(stride)
+    else:
+        for x in range(np.uint64(w)):
+            f, g = values[h + x], values[h2 + x] * factor
+            for x2 in range(x + np.uint64(1)):
+                own[t + x2] += f * values[h + x2] + g * values[h2 + x2]
+            t += np.uint64(stride)
+
+
+def _add_product(
+    values: Floats, upper: int, lower: int, w: int, upper2: int, lower2: int, w2: int, factor: float, own: Floats, to: int, stride: int
+) -> None:
+    """Add H'H of two rows of two nodes."""
+    h, h2, o, o2, t = np.uint64(upper), np.uint64(lower), np.uint64(upper2), np.uint64(lower2), np.uint64(to)
+    for x in range(np.uint64(w)):
+        f, g = values[h + x], values[h2 + x] * factor
+        for x2 in range(np.uint64(w2)):
+            own[t + x2] += f * values[o + x2] + g * values[o2 + x2]
+        t += np.uint64(stride)
+
+
+def _subtract_square(y: Floats, height: int, width: int, stride: int, out: Floats) -> None:
+    """Subtract Y'Y from the lower triangle of `out`, rows of both at a distance `stride`.
+
+    Six rows of Y, whose number is a multiple of that, meet four columns at a time; the distance is a multiple of eight, and columns
+    beyond the width are zero.
+    """
+    s, one = np.uint64(stride), np.uint64(1)
+    for first in range(0, height, SLAB):
+        for a in range(np.uint64(0), np.uint64(width), np.uint64(4)):
+            b, c, d = a + one, a + one + one, a + one + one + one
+            ta = a * s
+            tb = ta + s
+            tc = tb + s
+            td = tc + s
+            end = (a // np.uint64(8) + one) * np.uint64(8)
+            for k in range(first, min(first + SLAB, height), 6):
+                k0 = np.uint64(k) * s
+                k1 = k0 + s
+                k2 = k1 + s
+                k3 = k2 + s
+                k4 = k3 + s
+                k5 = k4 + s
+                a0, a1, a2, a3, a4, a5 = y[k0 + a], y[k1 + a], y[k2 + a], y[k3 + a], y[k4 + a], y[k5 + a]
+                b0, b1, b2, b3, b4, b5 = y[k0 + b], y[k1 + b], y[k2 + b], y[k3 + b], y[k4 + b], y[k5 + b]
+                c0, c1, c2, c3, c4, c5 = y[k0 + c], y[k1 + c], y[k2 + c], y[k3 + c], y[k4 + c], y[k5 + c]
+                d0, d1, d2, d3, d4, d5 = y[k0 + d], y[k1 + d], y[k2 + d], y[k3 + d], y[k4 + d], y[k5 + d]
+                for x in range(end):
+                    y0, y1, y2, y3, y4, y5 = y[k0 + x], y[k1 + x], y[k2 + x], y[k3 + x], y[k4 + x], y[k5 + x]
+                    out[ta + x] -= a0 * y0 + a1 * y1 + a2 * y2 + a3 * y3 + a4 * y4 + a5 * y5
+                    out[tb + x] -= b0 * y0 + b1 * y1 + b2 * y2 + b3 * y3 + b4 * y4 + b5 * y5
+                    out[tc + x] -= c0 * y0 + c1 * y1 + c2 * y2 + c3 * y3 + c4 * y4 + c5 * y5
+                    out[td + x] -= d0 * y0 + d1 * y1 + d2 * y2 + d3 * y3 + d4 * y4 + d5 * y5
+
+
 def _accumulate(clusters: Ints, front: Floats, y: Floats, rhs: Floats, b: Any, r: Floats, bad: NDArray[np.bool_], size: Ints) -> None:
-    """Add H'H - Y'Y of clusters to the lower triangle of a front, and what A'y leaves to `rhs`; store the triangular factors (P, 3, 3)."""
+    """Add H'H - Y'Y of clusters to the lower triangle of a front, and what A'y leaves to `rhs`; store the triangular factors (P, 3, 3).
+
+    Columns are scaled when a cluster is done.
+    """
     table, first_block, chunk, first_point, first_column = b.table, b.first_block, b.chunk, b.first_point, b.first_column
     cluster_rows, is_sparse, inverse = b.cluster_rows, b.sparse, b.inverse
     values, starts, row, point_inverse, prior, scalar = b.values, b.starts, b.row, b.point_inverse, b.prior, b.scalar
     q, left = np.empty((size[0], 3)), np.empty(size[0] + 1)
-    buffer, square, scale, right = np.empty(size[1]), np.empty(size[2]), np.empty(size[2]), np.empty(size[2])
-    stack, begins = np.empty((size[3], 2), np.int64), np.empty(3 * size[4], np.int64)
-    upper, lower = np.empty(size[5]), np.empty(size[5])
+    buffer, square, right = np.empty(size[1]), np.empty(size[2]), np.empty(size[2])
+    stack, parts = np.empty((size[3], 2), np.int64), np.empty(3 * size[4], np.int64)
     for c in clusters:
         offset = first_column[c]
         width = first_column[c + 1] - offset
         sparse = is_sparse[c]
-        height = 3 if sparse else 3 * (first_point[c + 1] - first_point[c])
-        stride = np.uint64(width)
-        for x in range(width):
-            scale[x] = inverse[offset + x]
-            right[x] = 0.0
-        lines = buffer[: height * width]
+        points = first_point[c + 1] - first_point[c]
+        height = 3 if sparse else (points + 1) // 2 * 6
+        stride = (width + 7) // 8 * 8
+        step = np.uint64(stride)
+        lines = buffer[: height * stride]
         lines[:] = 0.0
-        own = square[: width * width]
+        own = square[: stride * stride]
         own[:] = 0.0
+        right[:width] = 0.0
         for p in range(first_point[c], first_point[c + 1]):
             bad[p] = _factor_point(p, values, table, first_block, chunk, row, point_inverse, prior, q, 0, r, p) < 0
             if width == 0:
@@ -227,61 +339,59 @@ def _accumulate(clusters: Ints, front: Floats, y: Floats, rhs: Floats, b: Any, r
                     t1 += q[n, 1] * y[at + e]
                     t2 += q[n, 2] * y[at + e]
                     n += 1
-            y0 = 0 if sparse else 3 * (p - first_point[c]) * width
+            y0 = 0 if sparse else 3 * (p - first_point[c]) * stride
             n = touched = 0
             for i in range(first_block[p], first_block[p + 1]):
                 k = chunk[i]
                 m = table[k, 0]
+                count = _parts(table, starts, k, row[i], parts)
+                if sparse:
+                    touched = _touch(stack, touched, parts, count)
                 for e in range(0, m, 2):
-                    count = _lines_and_y(values, table, starts, k, row[i], e, scale, upper, lower, begins, lines, y0, width, q, n)
                     d0 = left[n] - (q[n, 0] * t0 + q[n, 1] * t1 + q[n, 2] * t2)
-                    d1 = 0.0
+                    n2, factor, d1 = n, 0.0, 0.0
                     if e + 1 < m:
-                        d1 = left[n + 1] - (q[n + 1, 0] * t0 + q[n + 1, 1] * t1 + q[n + 1, 2] * t2)
-                    n += min(2, m - e)
-                    if sparse and e == 0:
-                        touched = _touch(stack, touched, begins, count)
+                        n2, factor = n + 1, 1.0
+                        d1 = left[n2] - (q[n2, 0] * t0 + q[n2, 1] * t1 + q[n2, 2] * t2)
                     for g in range(0, count, 3):
-                        to, o = np.uint64(begins[g]), np.uint64(begins[g + 2])
-                        for x in range(np.uint64(begins[g + 1])):
-                            right[to + x] += upper[o + x] * d0 + lower[o + x] * d1
+                        s, w = parts[g], parts[g + 1]
+                        upper = parts[g + 2] + e * w
+                        lower = upper + (n2 - n) * w
+                        for x in range(np.uint64(w)):
+                            right[np.uint64(s) + x] += values[np.uint64(upper) + x] * d0 + values[np.uint64(lower) + x] * d1
+                        _add_y(values, upper, lower, w, q, n, n2, factor, lines, y0 + s, stride)
+                        _add_square(values, upper, lower, w, factor, own, s * stride + s, stride)
                         for g2 in range(0, count, 3):
-                            if begins[g2] > begins[g]:
-                                continue
-                            to = np.uint64(begins[g] * width + begins[g2])
-                            o, o2 = np.uint64(begins[g + 2]), np.uint64(begins[g2 + 2])
-                            for x in range(np.uint64(begins[g + 1])):
-                                u, v = upper[o + x], lower[o + x]
-                                for x2 in range(np.uint64(begins[g2 + 1])):
-                                    own[to + x2] += u * upper[o2 + x2] + v * lower[o2 + x2]
-                                to += stride
+                            s2, w2 = parts[g2], parts[g2 + 1]
+                            if s2 < s:
+                                upper2 = parts[g2 + 2] + e * w2
+                                lower2 = upper2 + (n2 - n) * w2
+                                _add_product(values, upper, lower, w, upper2, lower2, w2, factor, own, s * stride + s2, stride)
+                    n = n2 + 1
             if sparse:
                 for g in range(touched):
                     for g2 in range(touched):
                         if stack[g2, 0] <= stack[g, 0]:
-                            to = np.uint64(stack[g, 0] * width + stack[g2, 0])
+                            to = np.uint64(stack[g, 0] * stride + stack[g2, 0])
                             s2 = np.uint64(stack[g2, 0])
                             for x in range(np.uint64(stack[g, 0]), np.uint64(stack[g, 0] + stack[g, 1])):
-                                u0, u1, u2 = lines[x], lines[x + stride], lines[x + stride + stride]
+                                u0, u1, u2 = lines[x], lines[x + step], lines[x + step + step]
                                 for x2 in range(np.uint64(stack[g2, 1])):
-                                    own[to + x2] -= (
-                                        u0 * lines[s2 + x2] + u1 * lines[s2 + stride + x2] + u2 * lines[s2 + stride + stride + x2]
-                                    )
-                                to += stride
+                                    own[to + x2] -= u0 * lines[s2 + x2] + u1 * lines[s2 + step + x2] + u2 * lines[s2 + step + step + x2]
+                                to += step
                 for g in range(touched):
                     for a in range(3):
-                        for x in range(a * width + stack[g, 0], a * width + stack[g, 0] + stack[g, 1]):
+                        for x in range(a * stride + stack[g, 0], a * stride + stack[g, 0] + stack[g, 1]):
                             lines[x] = 0.0
         if width == 0:
             continue
         if not sparse:
-            table_of_y = lines.reshape((height, width))
-            own -= np.dot(table_of_y.T, table_of_y).reshape(width * width)
+            _subtract_square(lines, height, width, stride, own)
         for x in range(width):
-            fx = cluster_rows[offset + x]
-            rhs[fx] += right[x]
+            fx, f = cluster_rows[offset + x], inverse[offset + x]
+            rhs[fx] += right[x] * f
             for x2 in range(x + 1):
-                front[fx, cluster_rows[offset + x2]] += own[x * width + x2]
+                front[fx, cluster_rows[offset + x2]] += own[x * stride + x2] * (f * inverse[offset + x2])
 
 
 def _statistics(clusters: Ints, z: Floats, b: Any, hat: Floats, points: Floats, size: Ints) -> None:
@@ -571,5 +681,5 @@ def _gather(z: Floats, at: Ints, out: Floats) -> None:
             out[i, j] = z[at[i], at[j]]
 
 
-INNER = (_factor_point, _lines, _lines_and_y, _touch, _solved)
+INNER = (_sweep, _factor_point, _lines, _lines_and_y, _touch, _solved, _parts, _add_y, _six, _add_square, _add_product, _subtract_square)
 OUTER = (_accumulate, _statistics, _forward, _backward, _extend, _gather)
