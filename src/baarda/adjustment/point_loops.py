@@ -571,13 +571,35 @@ def _statistics(clusters: Ints, z: Floats, b: Any, hat: Floats, points: Floats, 
                     begin_q += rows[at_r]
 
 
+def _product(a: Floats, i: int, b: Floats, j: int, count: int) -> float:
+    """Return the product of two stretches of arrays."""
+    at, to = np.uint64(i), np.uint64(j)
+    if count == 6:
+        u, v = _six(a, at), _six(b, to)
+        return (u[0] * v[0] + u[1] * v[1]) + (u[2] * v[2] + u[3] * v[3]) + (u[4] * v[4] + u[5] * v[5])
+    total = 0.0
+    for x in range(np.uint64(count)):
+        total += a[at + x] * b[to + x]
+    return total
+
+
+def _widest(clusters: Ints, first_column: Ints) -> int:
+    width = 0
+    for c in clusters:
+        width = max(width, first_column[c + 1] - first_column[c])
+    return width
+
+
 def _forward(clusters: Ints, y: Floats, b: Any, r: Floats, out: Floats) -> None:
     """Add to `out`, the rows of a front, what A'y leaves for it when the points of clusters are eliminated."""
     values, table, starts, first_block, chunk, row = b.values, b.table, b.starts, b.first_block, b.chunk, b.row
     first_point, first_column, cluster_rows = b.first_point, b.first_column, b.cluster_rows
     inverse, point_inverse, scalar = b.inverse, b.point_inverse, b.scalar
+    right = np.empty(_widest(clusters, first_column))
     for c in clusters:
         offset = first_column[c]
+        width = first_column[c + 1] - offset
+        right[:width] = 0.0
         for p in range(first_point[c], first_point[c + 1]):
             t0 = t1 = t2 = 0.0
             for i in range(first_block[p], first_block[p + 1]):
@@ -605,10 +627,11 @@ def _forward(clusters: Ints, y: Floats, b: Any, r: Floats, out: Floats) -> None:
                         if table[k, HEAD + 2 + 3 * j] == 0 or s < 0:
                             continue
                         w = table[k, HEAD + 1 + 3 * j]
-                        h = np.uint64(table[k, HEAD + 3 * j] + (row[i] * m + e) * w)
-                        to = np.uint64(offset + s)
+                        h, to = np.uint64(table[k, HEAD + 3 * j] + (row[i] * m + e) * w), np.uint64(s)
                         for x in range(np.uint64(w)):
-                            out[cluster_rows[to + x]] += values[h + x] * inverse[to + x] * left
+                            right[to + x] += values[h + x] * left
+        for x in range(width):
+            out[cluster_rows[offset + x]] += right[x] * inverse[offset + x]
 
 
 def _backward(clusters: Ints, solution: Floats, y: Floats, b: Any, r: Floats, points: Floats, change: Floats) -> None:
@@ -616,8 +639,11 @@ def _backward(clusters: Ints, solution: Floats, y: Floats, b: Any, r: Floats, po
     values, table, starts, first_block, chunk, row = b.values, b.table, b.starts, b.first_block, b.chunk, b.row
     first_point, first_column, columns = b.first_point, b.first_column, b.cluster_columns
     inverse, point_inverse, scalar = b.inverse, b.point_inverse, b.scalar
+    local = np.empty(_widest(clusters, first_column))
     for c in clusters:
         offset = first_column[c]
+        for x in range(first_column[c + 1] - offset):
+            local[x] = solution[columns[offset + x]] * inverse[offset + x]
         for p in range(first_point[c], first_point[c + 1]):
             t0 = t1 = t2 = 0.0
             for i in range(first_block[p], first_block[p + 1]):
@@ -632,10 +658,7 @@ def _backward(clusters: Ints, solution: Floats, y: Floats, b: Any, r: Floats, po
                         if table[k, HEAD + 2 + 3 * j] == 0 or s < 0:
                             continue
                         w = table[k, HEAD + 1 + 3 * j]
-                        h = np.uint64(table[k, HEAD + 3 * j] + (row[i] * m + e) * w)
-                        to = np.uint64(offset + s)
-                        for x in range(np.uint64(w)):
-                            total += values[h + x] * (solution[columns[to + x]] * inverse[to + x])
+                        total += _product(values, table[k, HEAD + 3 * j] + (row[i] * m + e) * w, local, s, w)
                     change[at + e] = total
                     left = y[at + e] - total
                     t0 += values[base] * left
@@ -657,11 +680,12 @@ def _backward(clusters: Ints, solution: Floats, y: Floats, b: Any, r: Floats, po
 
 def _solved(r: Floats, p: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Return (R'R)^-1 (x, y, z) of a point."""
-    x /= r[p, 0, 0]
-    y = (y - r[p, 0, 1] * x) / r[p, 1, 1]
-    z = (z - r[p, 0, 2] * x - r[p, 1, 2] * y) / (r[p, 2, 2] * r[p, 2, 2])
-    y = (y - r[p, 1, 2] * z) / r[p, 1, 1]
-    x = (x - r[p, 0, 1] * y - r[p, 0, 2] * z) / r[p, 0, 0]
+    i0, i1, i2 = 1.0 / r[p, 0, 0], 1.0 / r[p, 1, 1], 1.0 / r[p, 2, 2]
+    x *= i0
+    y = (y - r[p, 0, 1] * x) * i1
+    z = (z - r[p, 0, 2] * x - r[p, 1, 2] * y) * i2 * i2
+    y = (y - r[p, 1, 2] * z) * i1
+    x = (x - r[p, 0, 1] * y - r[p, 0, 2] * z) * i0
     return x, y, z
 
 
@@ -681,5 +705,20 @@ def _gather(z: Floats, at: Ints, out: Floats) -> None:
             out[i, j] = z[at[i], at[j]]
 
 
-INNER = (_sweep, _factor_point, _lines, _lines_and_y, _touch, _solved, _parts, _add_y, _six, _add_square, _add_product, _subtract_square)
+INNER = (
+    _sweep,
+    _factor_point,
+    _lines,
+    _lines_and_y,
+    _touch,
+    _solved,
+    _parts,
+    _add_y,
+    _six,
+    _add_square,
+    _add_product,
+    _subtract_square,
+    _product,
+    _widest,
+)
 OUTER = (_accumulate, _statistics, _forward, _backward, _extend, _gather)
