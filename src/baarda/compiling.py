@@ -15,7 +15,8 @@ def compile_loops(functions: Sequence[Callable[..., Any]], inner: Sequence[Calla
     ----------
     functions : sequence of callable
     inner : sequence of callable
-        Functions that these call by their names in the same module; each may call those before it.
+        Functions that these call by their names in the same module; each may call those before it. They become part of their callers: a
+        true call counts a reference to each array, which costs more than many of them do.
 
     Returns
     -------
@@ -39,7 +40,7 @@ def compile_loops(functions: Sequence[Callable[..., Any]], inner: Sequence[Calla
         options = {"nogil": True, "cache": cached, "error_model": "numpy"}
         for function in inner:
             original = getattr(function, "py_func", function)
-            setattr(sys.modules[original.__module__], original.__name__, numba.njit(**options)(original))
+            setattr(sys.modules[original.__module__], original.__name__, numba.njit(**options, forceinline=True)(original))
         return [numba.njit(**options)(f) for f in functions]
 
     try:

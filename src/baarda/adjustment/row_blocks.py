@@ -141,8 +141,8 @@ def sizes(structure: Structure, blocks: Blocks) -> Ints:
     cluster, points of a cluster.
     """
     count = np.diff(structure.first_point)
-    width = np.diff(structure.first_column)
-    height = np.where(structure.sparse, 3, 3 * count)
+    width = (np.diff(structure.first_column) + 7) // 8 * 8  # rows begin at a distance that the loops can divide
+    height = np.where(structure.sparse, 3, (count + 1) // 2 * 6)
     table = blocks.table
     rows, parts = (int(a.max(initial=1)) for a in (table[:, 0], table[:, 1]))
     columns = int(table[:, HEAD + 1 :: 3].sum(axis=1).max(initial=1))
