@@ -189,8 +189,7 @@ class BlockSolver:
                     part = with_partials(self.blocks_, self.lin, run.spans)
                     self.loops.forward(run.clusters, y, part, self.triangles, shares[f])
 
-            for _ in for_each(range(len(s.fronts)), forward, self.lin.workers):
-                pass
+            for_each(range(len(s.fronts)), forward, self.lin.workers)
             reduced = _added(s, shares)
         for c, e, columns in self._rest:
             own = np.einsum("nmw,nm->nw", scaled_rows(c, e.rows, self.inverse), y[c.rows_of(e.rows)])
@@ -215,8 +214,7 @@ class BlockSolver:
         def backward(run: Run) -> None:
             self.loops.backward(run.clusters, solution, y, with_partials(self.blocks_, self.lin, run.spans), self.triangles, points, change)
 
-        for _ in for_each(s.runs, backward, self.lin.workers):
-            pass
+        for_each(s.runs, backward, self.lin.workers)
         for c, e, columns in self._rest:
             change[c.rows_of(e.rows)] = np.einsum("nmw,nw->nm", scaled_rows(c, e.rows, self.inverse), solution[columns])
         x[s.point_columns] = points

@@ -287,8 +287,7 @@ class _Filling:
         rows = self.rows.pop()
         self._put(0, rows)
         starts = np.cumsum([len(rows.index), *(piece.count for piece in self.later)])
-        for _ in for_each(range(len(self.later)), lambda i: self._add(int(starts[i]), self.later[i]), workers):
-            pass
+        for_each(range(len(self.later)), lambda i: self._add(int(starts[i]), self.later[i]), workers)
 
     def _add(self, start: int, piece: _Later) -> None:
         """Let a piece write its rows where they belong, or store what it computes."""
@@ -351,8 +350,7 @@ def whitened_misclosures(network: Network, state: State, groups: Sequence[Kind] 
                 for r in range(m):
                     out[first[piece.rows] + r] = white[:, r]
 
-            for _ in for_each(group.pieces(network), work, workers):
-                pass
+            for_each(group.pieces(network), work, workers)
         else:
             out[first[:, None] + np.arange(m)] = _white(group.misclosures(network, state), group, slice(None))
     return out
