@@ -50,7 +50,7 @@ class Part:
 
     def columns_of(self, rows: Any) -> Ints:
         """Return the (n, w) columns of some row blocks."""
-        return np.asarray(self.table[self.nodes[rows]])
+        return np.asarray(self.group.columns[self.group.offsets[self.nodes[rows]][:, None] + self.positions])
 
     @cached_property
     def table(self) -> Ints:
@@ -328,9 +328,12 @@ class Linearization:
             for_each(c.pieces(), partial(function, c), self.workers)
 
     @cached_property
-    def scale(self) -> Floats:
-        """The Euclidean norms of the columns of the design matrix, (u,), or of one nearby; 1 where a column is zero."""
-        if self.near is not None:
-            return self.near
+    def norms(self) -> Floats:
+        """The Euclidean norms of the columns of the design matrix, (u,); 1 where a column is zero."""
         norms = np.sqrt(self.column_sums(np.ones(self.count)))
         return np.where(norms > 0.0, norms, 1.0)
+
+    @property
+    def scale(self) -> Floats:
+        """The norms of the columns, (u,), or those of a system nearby."""
+        return self.norms if self.near is None else self.near

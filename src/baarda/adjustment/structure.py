@@ -21,7 +21,6 @@ from baarda.adjustment.cluster_loops import RowNodes
 from baarda.adjustment.clusters import clusters_of, starts_in_clusters
 from baarda.adjustment.dissection import dissect
 from baarda.adjustment.linear_system import Chunk, Linearization
-from baarda.adjustment.linearize import kept_positions
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -283,7 +282,7 @@ class _Nodes:
     def of(lin: Linearization, inner: Bools) -> _Nodes:
         number: dict[str, Ints] = {}
         widths, columns, count = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)], 0
-        kept = kept_positions(lin.unknowns)
+        kept = lin.unknowns.kept
         for group in lin.unknowns.groups:
             sizes = np.diff(group.offsets)
             free = np.add.reduceat(np.append(group.columns >= 0, False), group.offsets[:-1]) if len(sizes) else np.zeros(0)
