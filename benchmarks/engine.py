@@ -261,10 +261,10 @@ def middle(values: Any) -> float:
 @contextmanager
 def compiled_loops() -> Iterator[None]:
     """Compiled loops whatever the size."""
-    from baarda.adjustment import kernels, vector_loops
+    from baarda.adjustment import cluster_loops, kernels, vector_loops
     from baarda.observations import kernels as image_kernels
 
-    kept = [(m, m.COMPILE_FROM) for m in (kernels, vector_loops, image_kernels)]
+    kept = [(m, m.COMPILE_FROM) for m in (cluster_loops, kernels, vector_loops, image_kernels)]
     for module, _ in kept:
         module.COMPILE_FROM = 0
     try:

@@ -13,8 +13,8 @@ from threadpoolctl import threadpool_limits
 import baarda
 from baarda import cameras
 from baarda.adjustment import block as block_module
+from baarda.adjustment import cluster_loops, kernels, vector_loops, workers
 from baarda.adjustment import clusters as clusters_
-from baarda.adjustment import kernels, vector_loops, workers
 from baarda.adjustment.block import BlockSolver
 from baarda.adjustment.datum import find_defect
 from baarda.adjustment.dense import DenseSolver
@@ -31,7 +31,7 @@ from baarda.observations import kernels as image_kernels
 from baarda.procedures.synthetic import synthetic
 from networks import with_distances
 
-SWITCHES = (kernels, vector_loops, image_kernels)
+SWITCHES = (cluster_loops, kernels, vector_loops, image_kernels)
 EPS = np.finfo(float).eps
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import baarda
-from baarda.adjustment import datum, kernels, linearize, memory, pairs, vector_loops
+from baarda.adjustment import cluster_loops, datum, kernels, linearize, memory, pairs, vector_loops
 from baarda.adjustment.block import BlockSolver
 from baarda.adjustment.iteration import Control
 from baarda.adjustment.parameter_hypotheses import collinearity
@@ -28,7 +28,7 @@ from test_helmert import aerial
 def evaluated(monkeypatch):
     if kernels.compiled() is None:
         pytest.skip("numba is not installed")
-    for module in (kernels, vector_loops, image_kernels):
+    for module in (cluster_loops, kernels, vector_loops, image_kernels):
         monkeypatch.setattr(module, "COMPILE_FROM", 0)
     monkeypatch.setattr(linearize, "EVALUATED_FROM", 0)
 

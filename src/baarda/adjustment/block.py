@@ -6,6 +6,7 @@ share a point, which is all that the cofactors of points and the redundancy numb
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -125,7 +126,7 @@ class BlockSolver:
             border = updates[len(structure.fronts) - 1]
             border = np.tril(border) + np.tril(border, -1).T
         done = tuple(p for p in panels if p is not None)
-        rhs = _added(structure, shares) if loops.compiled else None
+        rhs = _added(structure, range(len(shares)), shares) if loops.compiled else None
         return BlockSolver(lin, structure, inverse, arrays, loops, triangles, done, size, rhs, border)
 
     def at(self, lin: Linearization | None) -> BlockSolver:
@@ -182,16 +183,14 @@ class BlockSolver:
         if self.rhs is not None and y is self.lin.misclosure:
             reduced = self.rhs.copy()
         else:
-            shares = [np.zeros(len(f.columns)) for f in s.fronts]
 
-            def forward(f: int) -> None:
-                for run in s.runs_of_fronts[f]:
-                    part = with_partials(self.blocks_, self.lin, run.spans)
-                    self.loops.forward(run.clusters, y, part, self.triangles, shares[f])
+            def forward(run: Run) -> Floats:
+                share = np.zeros(len(s.fronts[run.front].columns))
+                self.loops.forward(run.clusters, y, with_partials(self.blocks_, self.lin, run.spans), self.triangles, share)
+                return share
 
-            for _ in for_each(range(len(s.fronts)), forward, self.lin.workers):
-                pass
-            reduced = _added(s, shares)
+            runs = [run for run in s.runs if run.front >= 0]
+            reduced = _added(s, [run.front for run in runs], for_each(runs, forward, self.lin.workers))
         for c, e, columns in self._rest:
             own = np.einsum("nmw,nm->nw", scaled_rows(c, e.rows, self.inverse), y[c.rows_of(e.rows)])
             np.add.at(reduced, columns, own)
@@ -215,8 +214,7 @@ class BlockSolver:
         def backward(run: Run) -> None:
             self.loops.backward(run.clusters, solution, y, with_partials(self.blocks_, self.lin, run.spans), self.triangles, points, change)
 
-        for _ in for_each(s.runs, backward, self.lin.workers):
-            pass
+        for_each(s.runs, backward, self.lin.workers)
         for c, e, columns in self._rest:
             change[c.rows_of(e.rows)] = np.einsum("nmw,nw->nm", scaled_rows(c, e.rows, self.inverse), solution[columns])
         x[s.point_columns] = points
@@ -413,11 +411,11 @@ class BlockSolver:
         return selected_inverse(self)
 
 
-def _added(structure: Structure, shares: list[Floats]) -> Floats:
-    """Add up what the clusters of each front leave for its columns, (U + 1,); the last is for parameters that are fixed."""
+def _added(structure: Structure, fronts: Sequence[int], shares: list[Floats]) -> Floats:
+    """Add up what clusters leave for the columns of their fronts, (U + 1,); the last is for parameters that are fixed."""
     out = np.zeros(len(structure.order) + 1)
-    for front, share in zip(structure.fronts, shares, strict=True):
-        out[front.columns] += share
+    for f, share in zip(fronts, shares, strict=True):
+        out[structure.fronts[f].columns] += share
     return out
 
 

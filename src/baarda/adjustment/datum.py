@@ -89,7 +89,7 @@ def similarity_directions(unknowns: Unknowns, state: State, some: Ints | None = 
     return out
 
 
-SAMPLE = 10_000  # row blocks of a chunk that are looked at first
+SAMPLE = 2000  # row blocks of a chunk that are looked at first
 
 
 def find_defect(lin: Linearization, state: State) -> Defect:
@@ -104,7 +104,7 @@ def find_defect(lin: Linearization, state: State) -> Defect:
     -------
     Defect
     """
-    if lin.count > 8 * SAMPLE:
+    if lin.count > 40 * SAMPLE:
         a = lin.sample(SAMPLE).design
         used, columns = np.unique(a.indices, return_inverse=True)
         a = sparse.csr_array((a.data, columns, a.indptr), shape=(a.shape[0], len(used)))

@@ -129,14 +129,14 @@ def _vertex_cover(graph: Any, side: NDArray[np.bool_]) -> NDArray[np.bool_]:
     partner[match[match >= 0]] = np.flatnonzero(match >= 0)
     reached_left = (match < 0) & (np.diff(cut.indptr) > 0)
     reached_right = np.zeros(len(right), dtype=bool)
-    frontier = np.flatnonzero(reached_left)
-    while len(frontier):
-        new = np.unique(cut[frontier].indices)
-        new = new[~reached_right[new]]
-        reached_right[new] = True
-        frontier = partner[new]
-        frontier = frontier[(frontier >= 0) & ~reached_left[frontier]]
-        reached_left[frontier] = True
+    frontier, neighbours = reached_left, cut.T.astype(float)  # products of doubles are the quick ones
+    while frontier.any():
+        new = (neighbours @ frontier.astype(float) > 0.0) & ~reached_right
+        reached_right |= new
+        frontier = np.zeros(len(left), dtype=bool)
+        frontier[partner[new & (partner >= 0)]] = True
+        frontier &= ~reached_left
+        reached_left |= frontier
     cover = np.zeros(graph.shape[0], dtype=bool)
     cover[left[~reached_left & (np.diff(cut.indptr) > 0)]] = True
     cover[right[reached_right]] = True

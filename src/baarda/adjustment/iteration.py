@@ -225,9 +225,9 @@ def iterate(
             del lin
             lin = linearized(state, scale if full and relative < SCALED else None)
         if control.settled(relative, plain) and (full or _full_step(lin, tied, factor) <= 1e-6):
-            return state, replace(lin, near=None), control.history, True
+            return state, lin, control.history, True
         control.relax(relative)
-    return state, replace(lin, near=None), control.history, False
+    return state, lin, control.history, False
 
 
 def _step(lin: Linearization, solver: Solver, datum: Datum, y: Floats) -> tuple[Floats, Floats]:

@@ -50,7 +50,7 @@ class Part:
 
     def columns_of(self, rows: Any) -> Ints:
         """Return the (n, w) columns of some row blocks."""
-        return np.asarray(self.table[self.nodes[rows]])
+        return np.asarray(self.group.columns[self.group.offsets[self.nodes[rows]][:, None] + self.positions])
 
     @cached_property
     def table(self) -> Ints:
@@ -304,10 +304,8 @@ class Linearization:
         """Add up what the row blocks contribute to their columns."""
         loops = vector_loops(self.count)
         y = np.ascontiguousarray(y)
-        tasks = [(c, share) for c in self.chunks for share in c.shares()]
 
-        def contribute(task: tuple[Chunk, slice]) -> Floats:
-            c, share = task
+        def contribute(c: Chunk, share: slice) -> Floats:
             own = np.zeros((self.unknowns.count + 1, *y.shape[1:]))
             for some in [share] if c.evaluate is None else _pieces(share.start, share.stop):
                 for part, jacobian in zip(c.parts, c.partials(some), strict=True):
@@ -320,19 +318,22 @@ class Linearization:
             return own
 
         out = np.zeros((self.unknowns.count + 1, *y.shape[1:]))
-        for own in for_each(tasks, contribute, self.workers):
-            out += own
+        for c in self.chunks:
+            for own in for_each(c.shares(), partial(contribute, c), self.workers):
+                out += own
         return out[:-1]
 
     def _each(self, function: Callable[[Chunk, slice], None]) -> None:
         for c in self.chunks:
-            for _ in for_each(c.pieces(), partial(function, c), self.workers):
-                pass
+            for_each(c.pieces(), partial(function, c), self.workers)
 
     @cached_property
-    def scale(self) -> Floats:
-        """The Euclidean norms of the columns of the design matrix, (u,), or of one nearby; 1 where a column is zero."""
-        if self.near is not None:
-            return self.near
+    def norms(self) -> Floats:
+        """The Euclidean norms of the columns of the design matrix, (u,); 1 where a column is zero."""
         norms = np.sqrt(self.column_sums(np.ones(self.count)))
         return np.where(norms > 0.0, norms, 1.0)
+
+    @property
+    def scale(self) -> Floats:
+        """The norms of the columns, (u,), or those of a system nearby."""
+        return self.norms if self.near is None else self.near

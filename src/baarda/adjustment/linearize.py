@@ -107,7 +107,7 @@ def linearize(
         If a cofactor matrix is not positive definite.
     """
     arranged = groups if isinstance(groups, Arrangement) else Arrangement.of(groups)
-    kept = kept_positions(unknowns)
+    kept = unknowns.kept
     fillings: list[_Filling | Chunk] = []
     large = evaluated_groups(arranged.sorted, network, unknowns) if arranged.ranked else set()
     group: Any
@@ -153,7 +153,7 @@ def evaluated_groups(groups: Sequence[Kind], network: Network, unknowns: Unknown
     network : Network
     unknowns : Unknowns
     """
-    if not (unknowns["point"].columns.reshape(-1, 3) >= 0).any(axis=0).all():  # a coordinate that is fixed everywhere has no partials
+    if len(unknowns.kept.get(("point", 3), ())) < 3:  # a coordinate that is fixed everywhere has no partials
         return set()
     every: list[Any] = list(groups)
     others = [g for g in every if not hasattr(g, "pieces") and getattr(g, "kind", "point") == "point"]
@@ -164,7 +164,7 @@ def evaluated_groups(groups: Sequence[Kind], network: Network, unknowns: Unknown
 
 def _can_be_evaluated(group: Any, network: Network) -> bool:
     stretches = group.by_optics(network)
-    uncorrelated = not np.any(group.correlations)
+    uncorrelated = not np.any(group.correlations if group.correlations.strides[0] else group.correlations[:1])
     return uncorrelated and len(stretches) <= MANY_OPTICS and all(group.can_be_evaluated(optics) for optics, _ in stretches)
 
 
@@ -227,17 +227,6 @@ def _planned(group: Any, pieces: list[Any], first: Ints, network: Network, state
     return _Filling.of(rows, later, np.concatenate([first[p.rows] for p in pieces]), unknowns, kept, group.name)
 
 
-def kept_positions(unknowns: Unknowns) -> dict[tuple[str, int], Ints]:
-    """Return for each kind and width of nodes the positions where any node has an unknown."""
-    out: dict[tuple[str, int], Ints] = {}
-    for group in unknowns.groups:
-        widths = np.diff(group.offsets)
-        for width in np.unique(widths):
-            columns = group.columns[group.offsets[:-1][widths == width][:, None] + np.arange(width)]
-            out[group.kind, int(width)] = np.flatnonzero((columns >= 0).any(axis=0))
-    return out
-
-
 @dataclass(frozen=True)
 class _Later:
     """A piece: its number of row blocks, its images in words, what computes it, and what may write it straight into a chunk.
@@ -287,8 +276,7 @@ class _Filling:
         rows = self.rows.pop()
         self._put(0, rows)
         starts = np.cumsum([len(rows.index), *(piece.count for piece in self.later)])
-        for _ in for_each(range(len(self.later)), lambda i: self._add(int(starts[i]), self.later[i]), workers):
-            pass
+        for_each(range(len(self.later)), lambda i: self._add(int(starts[i]), self.later[i]), workers)
 
     def _add(self, start: int, piece: _Later) -> None:
         """Let a piece write its rows where they belong, or store what it computes."""
@@ -351,8 +339,7 @@ def whitened_misclosures(network: Network, state: State, groups: Sequence[Kind] 
                 for r in range(m):
                     out[first[piece.rows] + r] = white[:, r]
 
-            for _ in for_each(group.pieces(network), work, workers):
-                pass
+            for_each(group.pieces(network), work, workers)
         else:
             out[first[:, None] + np.arange(m)] = _white(group.misclosures(network, state), group, slice(None))
     return out
@@ -387,7 +374,7 @@ def _factor(cofactor: Floats, name: str) -> tuple[Floats, Floats]:
 
 def _diagonal(sigma: Floats) -> Floats:
     """Return the factors (N, m, m) of uncorrelated rows; (1, m, m) where all are equal."""
-    same = len(sigma) > 0 and bool(np.all(sigma == sigma[0]))
+    same = len(sigma) > 0 and (sigma.strides[0] == 0 or bool(np.all(sigma == sigma[0])))
     factor = np.zeros((1 if same else len(sigma), sigma.shape[1], sigma.shape[1]))
     np.einsum("nii->ni", factor)[...] = sigma[: len(factor)]
     return factor

@@ -224,7 +224,7 @@ def collinearity(adjustment: Adjustment) -> Collinearity | None:
     if not e.names:
         return None
     columns = np.array([adjustment.numbering.column(n) for n in e.names], dtype=np.intp)
-    inflation = variance_inflation(e.cofactors, adjustment.lin.scale[columns] ** 2)
+    inflation = variance_inflation(e.cofactors, adjustment.lin.norms[columns] ** 2)
     partners = _partners(adjustment, columns)
     mutual, indices, dependent = None, None, ""
     try:

@@ -12,6 +12,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
 BASE = 16  # points of the smallest cluster
+SAMPLE = 10_000  # points from which the extent of the object is taken
+CELLS = 500  # small clusters from which orders are compared
 
 
 def rank_of_points(coordinates: Floats) -> Ints:
@@ -35,8 +37,8 @@ def rank_of_points(coordinates: Floats) -> Ints:
     key = np.full(len(coordinates), np.iinfo(np.int64).max)
     if known.any():
         x = coordinates[known]
-        size = np.maximum(np.quantile(x, 0.99, axis=0) - np.quantile(x, 0.01, axis=0), 1e-300)
-        low = np.quantile(x, 0.01, axis=0)
+        low, high = np.quantile(x[:: len(x) // SAMPLE + 1], (0.01, 0.99), axis=0)
+        size = np.maximum(high - low, 1e-300)
         # one scale for all axes, so that cells are cubes and the relief of flat objects does not count
         cells = np.floor(np.clip((x - low) / size.max(), 0.0, 1.0) * (2**20 - 1)).astype(np.int64)
         key[known] = sum(_spread(cells[:, k]) << k for k in range(3))
@@ -69,9 +71,11 @@ def rank_for(groups: Sequence[Any], coordinates: Floats) -> Ints:
 
 def _spread_of_images(rank: Ints, images: Ints, points: Ints) -> float:
     """Return how many images see the points of a small cluster, as a mean of squares over some of the clusters."""
-    base = rank[points] // BASE
-    some = base % max(1, (len(rank) // BASE) // 500) == 0
-    pairs = np.unique(base[some] * (int(images.max(initial=0)) + 1) + images[some])
+    step = max(1, (len(rank) // BASE) // CELLS)
+    cluster = rank // BASE
+    chosen = np.where(cluster % step == 0, cluster // step, -1)[points]
+    some = np.flatnonzero(chosen >= 0)
+    pairs = np.unique(chosen[some] * (int(images.max(initial=0)) + 1) + images[some])
     return float(np.mean(np.unique(pairs // (int(images.max(initial=0)) + 1), return_counts=True)[1] ** 2.0))
 
 

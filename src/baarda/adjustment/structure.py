@@ -10,16 +10,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 
-from baarda.adjustment.clusters import clusters_of, slices, stretch
+from baarda.adjustment.cluster_loops import RowNodes
+from baarda.adjustment.clusters import clusters_of, starts_in_clusters
 from baarda.adjustment.dissection import dissect
 from baarda.adjustment.linear_system import Chunk, Linearization
-from baarda.adjustment.linearize import kept_positions
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -198,14 +199,16 @@ def analyse(lin: Linearization, rank: Ints, coordinates: Floats, border: Ints | 
     owner = [
         place[c.parts[j].nodes] if j >= 0 else np.full(len(c.first), -1, dtype=np.int32) for j, c in zip(part, lin.chunks, strict=True)
     ]
-    first_block, chunk, row = _blocks_by_point(owner, len(points))
-    seen = [nodes.of_chunk(c) for c in lin.chunks]  # (N, parts) nodes of each row block
-    first_point, members, sparse = clusters_of(first_block, chunk, row, seen, nodes.width)
+    blocks = nodes.of_blocks(lin.chunks, *_blocks_by_point(owner, len(points)))
+    first_point, member, ends, sparse = clusters_of(blocks, nodes.width)
+    cluster = np.repeat(np.arange(len(sparse)), np.diff(ends))
     rest = [(i, np.flatnonzero(o < 0)) for i, o in enumerate(owner) if (o < 0).any()]
-    cliques = [*members, *(m for i, rows in rest for m in _distinct(seen[i][rows]))]
-    centres = _centres(coordinates[points], first_point)
+    alone = [m for i, rows in rest for m in _distinct(blocks.of_chunk(i)[rows])]  # nodes of blocks without an inner point
+    clique = np.concatenate([cluster, np.repeat(len(sparse) + np.arange(len(alone)), [len(m) for m in alone]).astype(np.intp)])
+    joined = _joined([member, *alone])  # all nodes that something joins, and what joins them
     kept = nodes.holding(border)
-    parts = _dissected(_graph(cliques, nodes.count), nodes.places(members, centres), kept)
+    centres = _centres(coordinates[points], first_point)
+    parts = _dissected(_graph(clique, joined, nodes.count), nodes.places(member, cluster, centres), kept)
 
     elimination = np.concatenate([np.zeros(0, dtype=np.intp), *parts])
     position = np.empty(nodes.count, dtype=np.intp)
@@ -215,13 +218,12 @@ def analyse(lin: Linearization, rank: Ints, coordinates: Floats, border: Ints | 
     begin = np.empty(nodes.count, dtype=np.intp)
     begin[elimination] = np.cumsum(nodes.width[elimination]) - nodes.width[elimination]
 
-    member, cluster, ends = _flat(members)
-    member = member[np.lexsort((position[member], cluster))]
-    home = np.full(len(members), -1)
+    member = member[np.argsort(cluster * nodes.count + position[member])]
+    home = np.full(len(sparse), -1)
     home[cluster[::-1]] = front_of[member[::-1]]  # of the node that is eliminated first
     width = nodes.width[member]
     column = np.concatenate([[0], np.cumsum(width)])  # first column of each member, over all clusters
-    front_nodes = _nodes_of_fronts(parts, cliques, position, front_of)
+    front_nodes = _nodes_of_fronts(parts, clique, joined, position)
     fronts = _fronts(parts, front_nodes, home, nodes, begin, front_of)
     if kept.any():
         fronts = (*fronts[:-1], replace(fronts[-1], pivots=0))
@@ -231,10 +233,10 @@ def analyse(lin: Linearization, rank: Ints, coordinates: Floats, border: Ints | 
         order=nodes.unknowns[_ranges(nodes.offset[elimination], nodes.width[elimination])],
         points=points,
         point_columns=lin.unknowns["point"].columns.reshape(-1, 3)[points],
-        first_block=first_block,
-        block_chunk=chunk,
-        block_row=row,
-        starts=_starts(seen, chunk, row, first_block[first_point], (member, cluster, in_cluster, ends), nodes.count),
+        first_block=blocks.first,
+        block_chunk=blocks.chunk,
+        block_row=blocks.row,
+        starts=starts_in_clusters(blocks, first_point, member, ends, in_cluster, nodes.width, lin.workers),
         point_part=part,
         first_point=first_point,
         first_column=column[ends].astype(np.intp),
@@ -242,7 +244,7 @@ def analyse(lin: Linearization, rank: Ints, coordinates: Floats, border: Ints | 
         cluster_rows=_ranges(rows_in(home[cluster], member), width).astype(np.int32),
         sparse=sparse,
         fronts=fronts,
-        rest=tuple(_rest(i, rows, seen[i][rows], lin.chunks[i], position, front_of, rows_in) for i, rows in rest),
+        rest=tuple(_rest(i, rows, blocks.of_chunk(i)[rows], lin.chunks[i], position, front_of, rows_in) for i, rows in rest),
         border=int(nodes.width[kept].sum()),
     )
 
@@ -280,7 +282,7 @@ class _Nodes:
     def of(lin: Linearization, inner: Bools) -> _Nodes:
         number: dict[str, Ints] = {}
         widths, columns, count = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)], 0
-        kept = kept_positions(lin.unknowns)
+        kept = lin.unknowns.kept
         for group in lin.unknowns.groups:
             sizes = np.diff(group.offsets)
             free = np.add.reduceat(np.append(group.columns >= 0, False), group.offsets[:-1]) if len(sizes) else np.zeros(0)
@@ -288,11 +290,16 @@ class _Nodes:
             if group.kind == "point":
                 wanted &= ~inner
             number[group.kind] = np.where(wanted, count + np.cumsum(wanted) - 1, -1)
-            count += int(wanted.sum())
-            for node in np.flatnonzero(wanted):
-                own = group.columns[group.offsets[node] + kept[group.kind, int(sizes[node])]]
-                widths.append(np.array([len(own)]))
-                columns.append(own)
+            some = np.flatnonzero(wanted)
+            count += len(some)
+            width = np.array([len(kept[group.kind, n]) for n in sizes[some].tolist()], dtype=np.intp)
+            own = np.empty(width.sum(), dtype=np.intp)
+            for n in np.unique(sizes[some]).tolist():
+                nodes, at = np.flatnonzero(sizes[some] == n), kept[group.kind, n]
+                begin = (np.cumsum(width) - width)[nodes]
+                own[begin[:, None] + np.arange(len(at))] = group.columns[group.offsets[some[nodes]][:, None] + at]
+            widths.append(width)
+            columns.append(own)
         width = np.concatenate(widths)
         return _Nodes(number, width, np.concatenate([[0], np.cumsum(width)]).astype(np.intp), np.concatenate(columns))
 
@@ -307,31 +314,26 @@ class _Nodes:
         out[np.repeat(np.arange(self.count), self.width)[at]] = True
         return out
 
-    def of_chunk(self, c: Chunk) -> Small:
-        """Return the (N, parts) node numbers of row blocks."""
-        out = np.full((len(c.first), len(c.parts)), -1, dtype=np.int32)
-        for j, p in enumerate(c.parts):
-            if len(p.positions) and (self.number[p.kind] >= 0).any():
-                out[:, j] = self.number[p.kind][p.nodes]
+    def of_blocks(self, chunks: tuple[Chunk, ...], first: Ints, chunk: Small, row: Small) -> RowNodes:
+        """Return the node numbers of the row blocks of all chunks, those of inner points sorted."""
+        parts = np.array([len(c.parts) for c in chunks], dtype=np.intp)
+        place = np.cumsum([0, *(len(c.first) * len(c.parts) for c in chunks)], dtype=np.intp)
+        out = RowNodes(first, chunk, row, np.full(place[-1], -1, dtype=np.int32), place, parts)
+        for i, c in enumerate(chunks):
+            for own, p in zip(out.of_chunk(i).T, c.parts, strict=True):
+                if len(p.positions) and (self.number[p.kind] >= 0).any():
+                    own[:] = self.number[p.kind][p.nodes]
         return out
 
-    def places(self, members: list[Ints], centres: Floats) -> Floats | None:
+    def places(self, member: Ints, cluster: Ints, centres: Floats) -> Floats | None:
         """Return for each node the mean of the centres of its clusters; None where there are none."""
         if not len(centres) or not np.isfinite(centres).all():
             return None
-        at = _joined(members)
-        cluster = np.repeat(np.arange(len(members)), [len(m) for m in members])
-        count = np.bincount(at, minlength=self.count)
-        total = np.stack([np.bincount(at, centres[cluster, k], self.count) for k in range(3)], axis=1)
+        count = np.bincount(member, minlength=self.count)
+        total = np.stack([np.bincount(member, centres[cluster, k], self.count) for k in range(3)], axis=1)
         place = total / np.maximum(count, 1)[:, None]
         place[count == 0] = centres.mean(axis=0)
         return place
-
-
-def _flat(members: list[Ints]) -> tuple[Ints, Ints, Ints]:
-    """Return the members of all clusters one after the other, the cluster of each, and where each cluster begins, and ends."""
-    lengths = [len(m) for m in members]
-    return _joined(members), np.repeat(np.arange(len(members)), lengths), np.concatenate([[0], np.cumsum(lengths)]).astype(np.intp)
 
 
 def _joined(arrays: list[Ints]) -> Ints:
@@ -376,29 +378,34 @@ def _centres(coordinates: Floats, first_point: Ints) -> Floats:
     return np.asarray(np.add.reduceat(coordinates, first_point[:-1], axis=0) / np.diff(first_point)[:, None])
 
 
-def _graph(cliques: list[Ints], count: int) -> Any:
+def _graph(clique: Ints, node: Ints, count: int) -> Any:
     """Return the graph whose edges join all nodes of each clique."""
-    lengths = [len(m) for m in cliques]
-    at = (np.repeat(np.arange(len(cliques)), lengths), _joined(cliques))
-    incidence = coo_array((np.ones(sum(lengths), dtype=np.int32), at), shape=(len(cliques), count)).tocsr()
+    shape = (int(clique.max(initial=-1)) + 1, count)
+    incidence = coo_array((np.ones(len(node), dtype=np.int32), (clique, node)), shape=shape).tocsr()
     return (incidence.T @ incidence).tocsr()
 
 
-def _nodes_of_fronts(parts: list[Ints], cliques: list[Ints], position: Ints, front_of: Ints) -> list[Ints]:
-    """Return the nodes of each front in the order of elimination: those eliminated in it, then its boundary."""
-    found: list[list[Ints]] = [[p] for p in parts]
-    for m in cliques:
-        if len(m):
-            found[front_of[m[np.argmin(position[m])]]].append(m)
-    out = []
+def _nodes_of_fronts(parts: list[Ints], clique: Ints, node: Ints, position: Ints) -> list[Ints]:
+    """Return the nodes of each front in the order of elimination: those eliminated in it, then its boundary.
+
+    A clique belongs to the front where its first node is eliminated, and so does the boundary of a front.
+    """
+    count = len(position)
+    first = np.full(int(clique.max(initial=-1)) + 1, count)
+    np.minimum.at(first, clique, position[node])
+    front = np.repeat(np.arange(len(parts)), [len(p) for p in parts])  # of each position
+    of_cliques = np.unique(front[first[clique]] * count + position[node])
+    ends = np.searchsorted(of_cliques, np.arange(len(parts) + 1) * count)
+    order = np.concatenate([np.zeros(0, dtype=np.intp), *parts])
+    found: list[list[Ints]] = [[of_cliques[a:b] - f * count] for f, (a, b) in enumerate(pairwise(ends))]
+    out, begin = [], 0
     for f, own in enumerate(parts):
-        nodes = np.unique(np.concatenate(found[f]))
-        found[f] = []
-        nodes = nodes[np.argsort(position[nodes])]
-        boundary = nodes[len(own) :]
+        at = np.unique(np.concatenate([np.arange(begin, begin + len(own)), *found[f]]))
+        begin += len(own)
+        boundary = at[len(own) :]
         if len(boundary):
-            found[front_of[boundary[0]]].append(boundary)
-        out.append(nodes)
+            found[front[boundary[0]]].append(boundary)
+        out.append(order[at])
     return out
 
 
@@ -442,25 +449,6 @@ def _fronts(parts: list[Ints], front_nodes: list[Ints], home: Ints, nodes: _Node
             )
         )
     return tuple(out)
-
-
-def _starts(seen: list[Small], chunk: Small, row: Small, first: Ints, members: tuple[Ints, Ints, Ints, Ints], count: int) -> Small:
-    """Return for each chunk, one after the other, where the columns of each part begin in the cluster of the block.
-
-    `members` are nodes, their clusters, where they begin in these, and the first member of each cluster.
-    """
-    node, cluster, begin, ends = members
-    sizes = np.cumsum([0, *(numbers.size for numbers in seen)])
-    flat = np.full(sizes[-1], -1, dtype=np.int32)
-    out = [flat[a:b].reshape(numbers.shape) for a, b, numbers in zip(sizes[:-1], sizes[1:], seen, strict=True)]
-    for a, b in slices(first, 256):
-        table = np.full((b - a, count + 1), -1, dtype=np.int32)
-        some = slice(ends[a], ends[b])
-        table[cluster[some] - a, node[some]] = begin[some]
-        for i, at, base in stretch(first, a, b, chunk):
-            rows = row[at]
-            out[i][rows] = table[base[:, None], seen[i][rows]]
-    return flat
 
 
 def _rest(i: int, rows: Ints, sets: Small, c: Chunk, position: Ints, front_of: Ints, rows_in: _RowsInFronts) -> Rest:

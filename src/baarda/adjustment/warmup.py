@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from baarda.adjustment import kernels, vector_loops
+from baarda.adjustment import cluster_loops, kernels, vector_loops
 from baarda.adjustment.solve import adjust
 from baarda.network import Network
 from baarda.observations import kernels as image_point_loops
@@ -25,7 +25,7 @@ def warm_up(network: Network) -> bool:
     """
     if kernels.compiled() is None:
         return False
-    modules: tuple[Any, ...] = (kernels, vector_loops, image_point_loops)
+    modules: tuple[Any, ...] = (cluster_loops, kernels, vector_loops, image_point_loops)
     limits = [m.COMPILE_FROM for m in modules]
     try:
         for m in modules:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import heapq
+import itertools
 import threading
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from typing import Any, TypeVar
@@ -21,39 +21,63 @@ S = TypeVar("S")
 T = TypeVar("T")
 
 
-def for_each(items: Sequence[S], function: Callable[[S], T], workers: int | None = None) -> Iterator[T]:
-    """Apply a function to items by a few threads and yield the results in order, a bounded number of them ahead.
+def for_each(items: Sequence[S], function: Callable[[S], T], workers: int | None = None) -> list[T]:
+    """Apply a function to items by a few threads, this one included, and return the results in order.
 
     Parameters
     ----------
     items : sequence
+        Begun one after the other.
     function : callable
         It should release the interpreter lock, and not use `for_each` itself.
     workers : int, optional
         Number of threads; one for each core.
 
+    Raises
+    ------
+    BaseException
+        What the function raised for the first item that failed; those after it may not have been begun.
+
     Examples
     --------
-    >>> list(for_each([1, 2, 3], lambda x: x * x, workers=2))
+    >>> for_each([1, 2, 3], lambda x: x * x, workers=2)
     [1, 4, 9]
     """
     threads = min(worker_count(workers), len(items))
     if threads <= 1:
-        for item in items:
-            yield function(item)
-        return
-    pool = _pool(threads)
-    window: deque[Future[T]] = deque()
+        return [function(item) for item in items]
+    results: dict[int, T] = {}
+    failures: dict[int, BaseException] = {}
+    tickets = itertools.count()  # a number is drawn in less time than a task is handed over
+
+    def work() -> None:
+        while not failures and (i := next(tickets)) < len(items):
+            try:
+                results[i] = function(items[i])
+            except BaseException as error:  # handed to the caller
+                failures[i] = error
+
+    _together(work, lambda error: failures.setdefault(-1, error), threads)
+    if failures:
+        raise failures[min(failures)]
+    return [results[i] for i in range(len(items))]
+
+
+def _together(work: Callable[[], None], stop: Callable[[BaseException], object], threads: int) -> None:
+    """Do the same work in several threads, this one included; it ends by itself, or soon after an interruption was handed to `stop`."""
+    others = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
     try:
-        for item in items:
-            window.append(pool.submit(function, item))
-            if len(window) > 4 * threads:
-                yield window.popleft().result()
-        while window:
-            yield window.popleft().result()
-    finally:
-        for left in window:
-            left.cancel()
+        work()
+        _wait(others)
+    except BaseException as error:  # an interruption outside a task
+        stop(error)
+        _wait(others)
+
+
+def _wait(others: list[Future[None]]) -> None:
+    for other in others:
+        if not other.cancel():  # what has not begun is not needed any more
+            other.result()
 
 
 @cache
@@ -127,9 +151,7 @@ def run_tree(before: Sequence[int], after: Sequence[Sequence[int]], function: Ca
             try:
                 function(task)
             except BaseException as error:  # handed to the caller
-                with condition:
-                    failure.append(error)
-                    condition.notify_all()
+                stop(error)
                 return
             with condition:
                 left -= 1
@@ -139,16 +161,11 @@ def run_tree(before: Sequence[int], after: Sequence[Sequence[int]], function: Ca
                         heapq.heappush(ready, other)
                 condition.notify_all()
 
-    others = [threading.Thread(target=work, daemon=True) for _ in range(threads - 1)]
-    for thread in others:
-        thread.start()
-    try:
-        work()
-    except BaseException as error:  # an interruption between tasks
+    def stop(error: BaseException) -> None:
         with condition:
             failure.append(error)
             condition.notify_all()
-    for thread in others:
-        thread.join()
+
+    _together(work, stop, threads)
     if failure:
         raise failure[0]

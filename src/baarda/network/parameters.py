@@ -73,6 +73,17 @@ class Unknowns:
             out[g.columns[g.columns >= 0]] = i
         return out
 
+    @cached_property
+    def kept(self) -> dict[tuple[str, int], Ints]:
+        """For each kind and width of nodes the positions where any node has an unknown."""
+        out: dict[tuple[str, int], Ints] = {}
+        for group in self.groups:
+            widths = np.diff(group.offsets)
+            for width in np.unique(widths).tolist():
+                nodes = group.columns[group.offsets[:-1][widths == width][:, None] + np.arange(width)]
+                out[group.kind, width] = np.flatnonzero((nodes >= 0).any(axis=0))
+        return out
+
     def name(self, column: int) -> str:
         """Return the name of one unknown, ``kind label: parameter``."""
         for g in self.groups:
