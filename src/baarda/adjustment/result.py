@@ -139,11 +139,12 @@ class Adjustment:
         for c in self.lin.chunks:
             correlated = c.correlated
             for some in c.pieces():
-                factor, misclosure = c.factor[some], c.misclosure[some]
+                rows, factor = c.rows_of(some), c.factor[some]
+                misclosure = self.lin.misclosure[rows]
                 if correlated:
-                    out[c.rows_of(some)] = -(factor @ misclosure[:, :, None])[:, :, 0]
+                    out[rows] = -(factor @ misclosure[:, :, None])[:, :, 0]
                 else:
-                    out[c.rows_of(some)] = -np.einsum("nii->ni", factor) * misclosure
+                    out[rows] = -np.einsum("nii->ni", factor) * misclosure
         return out
 
     @cached_property
@@ -169,7 +170,8 @@ class Adjustment:
             diagonal = _plain if not c.correlated and c.controlled is None else _full
             for some in c.pieces():
                 controlled = None if c.controlled is None else c.controlled[some]
-                rows, found = c.rows_of(some), diagonal(names, c.factor[some], hat[some], c.misclosure[some], controlled)
+                rows = c.rows_of(some)
+                found = diagonal(names, c.factor[some], hat[some], self.lin.misclosure[rows], controlled)
                 for name, values in found.items():
                     out[name][rows] = values
         return out

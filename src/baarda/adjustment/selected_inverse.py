@@ -90,8 +90,7 @@ def selected_inverse(solver: BlockSolver) -> tuple[list[Floats], Floats, NodeBlo
                 _rest_hat(lin, solver.inverse, blocks.hat, np.zeros((0, 0)), chunk, rows, at, hat)
     out = []
     for k, c in enumerate(lin.chunks):
-        m = c.misclosure.shape[1]
-        out.append(hat[blocks.hat[k] : blocks.hat[k + 1]].reshape(-1, m, m))
+        out.append(hat[blocks.hat[k] : blocks.hat[k + 1]].reshape(-1, c.m, c.m))
     return out, points, NodeBlocks(structure, [z for z in own if z is not None], solver.inverse)
 
 
@@ -101,7 +100,7 @@ def _rest_hat(lin: Linearization, inverse: Floats, begins: Ints, z: Floats, chun
     h = scaled_rows(c, rows, inverse)
     padded = np.zeros((len(z) + 1, len(z) + 1))
     padded[:-1, :-1] = z
-    m = c.misclosure.shape[1]
+    m = c.m
     values = h @ padded[at[:, :, None], at[:, None, :]] @ h.transpose(0, 2, 1)
     hat[begins[chunk] + rows[:, None] * (m * m) + np.arange(m * m)] = values.reshape(len(rows), -1)
 
