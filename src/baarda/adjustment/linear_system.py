@@ -114,7 +114,12 @@ class Chunk:
     def correlated(self) -> bool:
         """Whether rows of a block are correlated."""
         factor = self.factor[:1] if self.factor.strides[0] == 0 else self.factor
-        return factor.shape[1] > 1 and bool(np.any(np.tril(factor, -1)))
+        return any(bool(factor[:, i, j].any()) for i in range(self.m) for j in range(i))
+
+    @property
+    def plain(self) -> bool:
+        """Whether rows are uncorrelated and controlled in full, so that of their statistics only diagonals count."""
+        return self.controlled is None and not self.correlated
 
     def pieces(self) -> list[slice]:
         """Return slices of row blocks that one task handles."""

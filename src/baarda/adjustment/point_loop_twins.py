@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baarda.adjustment.point_loops import SMALLEST
-from baarda.adjustment.row_blocks import HEAD, Blocks
+from baarda.adjustment.row_blocks import HEAD, Blocks, put_hat
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -132,7 +132,7 @@ def statistics(clusters: Ints, z: Floats, b: Blocks, hat: Floats, points: Floats
             mixed = g.q @ picked @ g.h.transpose(0, 2, 1)
             h = g.q @ core[g.points] @ g.q.transpose(0, 2, 1) - mixed - mixed.transpose(0, 2, 1)
             h += g.h @ local[g.at[:, :, None], g.at[:, None, :]] @ g.h.transpose(0, 2, 1)
-            hat[b.hat[g.kind] + g.rows[:, None] * (m * m) + np.arange(m * m)] = h.reshape(len(h), -1)
+            put_hat(hat, b.hat[g.kind], g.rows, h)
 
 
 def extend(front: Floats, update: Floats, at: Ints) -> None:

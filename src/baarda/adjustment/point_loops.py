@@ -285,7 +285,10 @@ def _accumulate(clusters: Ints, front: Floats, y: Floats, rhs: Floats, b: Any, r
 
 
 def _statistics(clusters: Ints, z: Floats, b: Any, hat: Floats, points: Floats, size: Ints) -> None:
-    """Store the diagonal blocks of A N^-1 A' and the cofactors (P, 3, 3) of points, from the inverse z of the front of their clusters."""
+    """Store the diagonal blocks of A N^-1 A', or only their diagonals, and the cofactors (P, 3, 3) of points.
+
+    They come from the inverse z of the front of their clusters.
+    """
     table, first_block, chunk, row, first_point, first_column = b.table, b.first_block, b.chunk, b.row, b.first_point, b.first_column
     values, starts, prior = b.values, b.starts, b.prior
     cluster_rows, is_sparse, inverse, point_inverse, hats = b.cluster_rows, b.sparse, b.inverse, b.point_inverse, b.hat
@@ -395,7 +398,8 @@ def _statistics(clusters: Ints, z: Floats, b: Any, hat: Floats, points: Floats, 
                 for i in range(first_block[p], first_block[p + 1]):
                     k = chunk[i]
                     m = table[k, 0]
-                    out = hats[k] + row[i] * m * m
+                    whole = hats[k, 1] == m * m
+                    out = hats[k, 0] + row[i] * hats[k, 1]
                     for e2 in range(0, m, 2):  # two columns of the block at once
                         count = _lines(values, table, starts, k, row[i], e2, scale, upper, lower, begins)
                         for x in range(size[5]):
@@ -424,10 +428,14 @@ def _statistics(clusters: Ints, z: Floats, b: Any, hat: Floats, points: Floats, 
                                 mixed[2, 1] += f2 * v
                         for e in range(0, m, 2):
                             if e != e2:
+                                if not whole:
+                                    continue
                                 count = _lines(values, table, starts, k, row[i], e, scale, more_upper, more_lower, begins)
                             end = begins[count - 1] + begins[count - 2] if count else 0
                             for d in range(min(2, m - e)):
                                 for d2 in range(min(2, m - e2)):
+                                    if d != d2 and not whole:
+                                        continue
                                     if e == e2 and d == 0:
                                         own = upper
                                     elif e == e2:
@@ -446,8 +454,8 @@ def _statistics(clusters: Ints, z: Floats, b: Any, hat: Floats, points: Floats, 
                                         for a2 in range(3):
                                             part += core[a, a2] * q_all[n + e2 + d2, a2]
                                         total += q_all[n + e + d, a] * part
-                                    hat[out + (e + d) * m + e2 + d2] = total
-                    for e in range(m):  # both mixed terms are their mean
+                                    hat[out + ((e + d) * m + e2 + d2 if whole else e + d)] = total
+                    for e in range(m if whole else 0):  # both mixed terms are their mean
                         for e2 in range(e):
                             mean = 0.5 * (hat[out + e * m + e2] + hat[out + e2 * m + e])
                             hat[out + e * m + e2] = hat[out + e2 * m + e] = mean

@@ -37,8 +37,8 @@ class Blocks(NamedTuple):
     point_inverse : (P, 3) array
     prior : (P, 3) array
         A further row for each coordinate of a point: damping, or 1 where the coordinate is held.
-    hat : array
-        Where the diagonal blocks of A N^-1 A' of each chunk begin.
+    hat : (chunks, 2) int array
+        Where the diagonal blocks of A N^-1 A' of each chunk begin, and the numbers stored of each: see `hats_of`.
     scalar : int32 or int array
         First scalar row of each row block, chunk after chunk.
     """
@@ -73,7 +73,6 @@ def blocks_of(lin: Linearization, structure: Structure, inverse: Floats, damping
     damping : float
         Added to the diagonal of the scaled normal matrix.
     """
-    hats = [len(c.first) * c.m**2 for c in lin.chunks]
     point_inverse = inverse[structure.point_columns]
     prior = np.where(point_inverse > 0.0, np.sqrt(damping), 1.0)
     columns = structure.order[structure.cluster_columns]
@@ -82,8 +81,29 @@ def blocks_of(lin: Linearization, structure: Structure, inverse: Floats, damping
         lin.values, table_of(lin, structure),
         structure.starts, structure.first_block, structure.block_chunk, structure.block_row, structure.first_point,
         structure.first_column, structure.cluster_rows, structure.cluster_columns, structure.sparse, inverse[columns], point_inverse, prior,
-        np.cumsum([0, *hats], dtype=np.intp), np.ascontiguousarray(scalar),
+        np.zeros((0, 2), dtype=np.intp), np.ascontiguousarray(scalar),
     )  # fmt: skip
+
+
+def hats_of(lin: Linearization, whole: bool) -> tuple[Ints, int]:
+    """Return where the diagonal blocks of A N^-1 A' of each chunk begin, the numbers stored of each, (chunks, 2), and the size of all.
+
+    Parameters
+    ----------
+    lin : Linearization
+    whole : bool
+        Store the m x m numbers of all blocks; else only the m of their diagonals where the chunk is plain.
+    """
+    each = np.array([c.m if c.plain and not whole else c.m**2 for c in lin.chunks], dtype=np.intp)
+    ends = np.cumsum([0, *(n * len(c.first) for n, c in zip(each, lin.chunks, strict=True))], dtype=np.intp)
+    return np.stack([ends[:-1], each], axis=1), int(ends[-1])
+
+
+def put_hat(hat: Floats, place: Ints, rows: Ints, values: Floats) -> None:
+    """Store the diagonal blocks (N, m, m) of A N^-1 A' of some row blocks of a chunk, or only their diagonals, as `place` of it says."""
+    begin, each = place
+    own = values.reshape(len(values), -1) if each == values[:1].size else np.einsum("nii->ni", values)
+    hat[begin + rows[:, None] * each + np.arange(each)] = own
 
 
 def table_of(lin: Linearization, structure: Structure) -> Ints:
