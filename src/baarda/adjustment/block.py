@@ -19,6 +19,7 @@ from baarda.adjustment import lapack
 from baarda.adjustment.dense import refuse_null_space
 from baarda.adjustment.kernels import Kernels, kernels
 from baarda.adjustment.linear_system import Linearization
+from baarda.adjustment.memory import release
 from baarda.adjustment.pairs import pairs
 from baarda.adjustment.row_blocks import Blocks, blocks_of, scaled_rows, sizes, table_of, with_partials
 from baarda.adjustment.selected_inverse import Statistics, selected_inverse
@@ -125,6 +126,7 @@ class BlockSolver:
             border = updates[len(structure.fronts) - 1]
             border = np.tril(border) + np.tril(border, -1).T
         done = tuple(p for p in panels if p is not None)
+        release(lin.count)  # what the fronts took
         rhs = _added(structure, shares) if loops.compiled else None
         return BlockSolver(lin, structure, inverse, arrays, loops, triangles, done, size, rhs, border)
 

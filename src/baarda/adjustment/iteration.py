@@ -169,11 +169,8 @@ def iterate(
         largest = np.maximum(largest, lin.scale)
         return replace(lin, near=largest)
 
-    def misclosures(step: Floats) -> tuple[State, Floats, float]:
-        trial = moved(step)
-        values = whitened_misclosures(network, trial, groups, workers)
-        with np.errstate(over="ignore"):
-            return trial, values, float(values @ values) if np.isfinite(values).all() else np.inf
+    def misclosures(there: State) -> Floats:
+        return whitened_misclosures(network, there, groups, workers)
 
     tied, unknowns, workers = datum, lin.unknowns, lin.workers
     untied = replace(datum, held=np.zeros(0, dtype=np.intp), conditions=None)  # damping ties the datum down by itself
@@ -198,24 +195,24 @@ def iterate(
             step, plain = lengthened * step, straight and lengthened == 1.0
         predicted = 2.0 * lengthened * float(change @ lin.misclosure) - lengthened**2 * squares
         if lengthened == 1.0 and control.bends(relative):
-            step, plain, bent = _bent(lin, solver, datum, step, change, lambda x: misclosures(x)[1]), False, True
-        near = control.near(relative)
+            step, plain, bent = _bent(lin, solver, datum, step, change, lambda x: misclosures(moved(x))), False, True
+        near, full, trial = control.near(relative), control.damping == 0.0, moved(step)
+        before = change if full and lengthened == 1.0 else None
+        del change  # its memory is needed, and that of the system
         if near:  # linearised at once
-            trial, solver, scale = moved(step), solver.at(None), lin.scale
-            del lin  # its memory is needed
+            solver, scale = solver.at(None), lin.scale
+            del lin
             lin = linearized(trial, scale)
-            with np.errstate(over="ignore"):
-                value = float(lin.misclosure @ lin.misclosure)
+            value = _squares(lin.misclosure)
         else:
-            trial, _, value = misclosures(step)
-        full = control.damping == 0.0
+            value = _squares(misclosures(trial))
         if not control.takes(value, predicted, relative):
             before, solver, straight = None, None, False
             if near:
                 lin = linearized(state, scale)
             continue
         state = trial
-        before, straight = change if full and lengthened == 1.0 else None, full and lengthened == 1.0 and not bent
+        straight = before is not None and not bent
         solver = solver.at(None) if full and relative <= REUSE else None
         if not near:
             scale = lin.scale
@@ -225,6 +222,12 @@ def iterate(
             return state, replace(lin, near=None), control.history, True
         control.relax(relative)
     return state, replace(lin, near=None), control.history, False
+
+
+def _squares(values: Floats) -> float:
+    """Return the sum of squares, infinite where a number is not finite."""
+    with np.errstate(over="ignore"):
+        return float(values @ values) if np.isfinite(values).all() else np.inf
 
 
 def _step(lin: Linearization, solver: Solver, datum: Datum, y: Floats) -> tuple[Floats, Floats]:
@@ -259,7 +262,11 @@ def _bent(
 ) -> Floats:
     """Add the second-order correction to a step, where it is smaller than the step."""
     h = 0.1
-    curvature = 2.0 / h * ((lin.misclosure - misclosures(h * step)) / h - change)
+    curvature = misclosures(h * step)  # 2 ((l - l(h)) / h - change) / h, in place
+    np.subtract(lin.misclosure, curvature, out=curvature)
+    curvature /= h
+    curvature -= change
+    curvature *= 2.0 / h
     if not np.isfinite(curvature).all():
         return step
     bend = -0.5 * _step(lin, solver, datum, curvature)[0]

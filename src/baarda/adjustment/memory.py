@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -17,6 +20,7 @@ from baarda.observations import Kind
 
 DOUBLE = 8
 TOLD_FROM = 0.5e9  # bytes
+MANY = 500_000  # observations from which it is worth the time to hand memory back
 
 
 def available() -> float:
@@ -48,6 +52,21 @@ def _resident() -> float:
     except (OSError, ValueError, IndexError):
         return 0.0
     return float(pages) * float(os.sysconf("SC_PAGE_SIZE"))
+
+
+@cache
+def _trim() -> Callable[[int], int] | None:
+    try:
+        return cast(Callable[[int], int], ctypes.CDLL(None).malloc_trim)
+    except (AttributeError, OSError, TypeError):  # another C library
+        return None
+
+
+def release(count: int) -> None:
+    """Hand back to the system what was freed but the C library keeps, where it can be asked for that, after work on many observations."""
+    trim = _trim()
+    if trim is not None and count >= MANY:
+        trim(0)
 
 
 def of_rows(unknowns: Unknowns, groups: Sequence[Kind], network: Network) -> float:

@@ -16,6 +16,7 @@ from baarda.adjustment.covariance import Cofactors
 from baarda.adjustment.datum import Datum
 from baarda.adjustment.linear_system import Chunk, Linearization
 from baarda.adjustment.linearize import offsets_of
+from baarda.adjustment.memory import release
 from baarda.adjustment.solver import Solver
 from baarda.errors import UsageError
 from baarda.geometry import rotation as rot
@@ -149,8 +150,11 @@ class Adjustment:
 
     @cached_property
     def sigmas(self) -> Floats:
-        """A-priori standard deviations of all n observations."""
-        return np.concatenate([g.sigma().ravel() for g in self.groups])
+        """A-priori standard deviations of all n observations; one number in memory where all are equal."""
+        given = [g.sigma() for g in self.groups]
+        if all(not any(s.strides) and s.flat[0] == given[0].flat[0] for s in given):
+            return np.broadcast_to(given[0].flat[0], (self.count,))
+        return np.concatenate([s.ravel() for s in given])
 
     @cached_property
     def _shares(self) -> tuple[Floats, dict[int, Floats]]:
@@ -166,6 +170,8 @@ class Adjustment:
                     out[c.rows_of(some)] = np.einsum("nij,nji->ni", left, inverse)
                 else:
                     out[c.rows_of(some)] = 1.0 - hats[k][some]
+        del hats
+        release(self.count)
         return out, whole
 
     def _diagonal(self, plain: Callable[[Floats, Floats], Floats], full: Callable[[Floats, Floats], Floats]) -> Floats:
@@ -201,6 +207,8 @@ class Adjustment:
     @cached_property
     def qvv(self) -> Floats:
         """Diagonal of the cofactor matrix of the residuals."""
+        if all(c.plain and not c.factor.strides[0] and (np.diagonal(c.factor[0]) == 1.0).all() for c in self.lin.chunks if len(c.first)):
+            return self.redundancy_numbers  # all standard deviations are 1
         return self._diagonal(lambda sigma, r: r * sigma**2, lambda f, rest: np.einsum("nij,nij->ni", f @ rest, f))
 
     @cached_property

@@ -154,7 +154,7 @@ def adjust(network: Network, **options: Any) -> Adjustment:
 
 def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDArray[np.bool_], notes: list[str]) -> Adjustment:
     prepared, more = complete(prepared, aside)
-    shift = -prepared.centroid()
+    source, shift = prepared, -prepared.centroid()
     prepared = prepared.shifted(shift)
     groups = active_groups(prepared, ~aside)
     unknowns = unknowns_of(prepared, ~aside, np.isin(np.arange(len(prepared.cameras)), prepared.images.cameras))
@@ -185,6 +185,7 @@ def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDAr
         )
     structure = analyse(lin, rank, start.points) if kind == "block" else None
     if structure is not None:
+        memory.release(lin.count)
         memory.check(memory.of_fronts(structure), "the factor and its inverse", settings.tell)
 
     def factor(lin: Linearization, datum: Datum, damping: float = 0.0) -> Solver:
@@ -202,11 +203,11 @@ def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDAr
         state, lin, history, converged, law = found
         more = [*more, *law.assumptions]
     datum = choose_datum(find_defect(lin, state) if defect.count else defect, lin, settings, prepared)
+    memory.release(lin.count)
     solver = factor(lin, datum)
-    adjusted = state.write_to(prepared).shifted(-shift)
     return Adjustment(
-        network=adjusted,
-        start=start.write_to(prepared).shifted(-shift),
+        network=state.shifted(-shift).write_to(source),
+        start=source,
         numbering=unknowns,
         groups=tuple(groups),
         lin=lin,

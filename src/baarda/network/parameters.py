@@ -17,6 +17,8 @@ from baarda.network.network import AXES, EXTERIOR, Network
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
+PIECE = 65536  # points that are moved at a time
+
 
 @dataclass(frozen=True)
 class UnknownGroup:
@@ -257,6 +259,11 @@ class State:
             tuple(d.moved(padded[unknowns[d.kind].columns]) for d in self.declared),
         )
 
+    def shifted(self, shift: Floats) -> State:
+        """Return the state with `shift` added to all object coordinates."""
+        declared = tuple(d.shifted(shift) for d in self.declared)
+        return State(self.cameras, self.position + shift, self.rotation, self.points + shift, declared)
+
     def write_to(self, network: Network) -> Network:
         """Return the network with these values in its tables."""
         from dataclasses import replace
@@ -283,6 +290,14 @@ def along_rays(points: Floats, steps: Floats, centres: Floats | None) -> Floats:
     """
     if centres is None:
         return steps
+    out = np.empty_like(steps)
+    for begin in range(0, len(steps), PIECE):
+        some = slice(begin, begin + PIECE)
+        out[some] = _along_rays(points[some], steps[some], centres[some])
+    return out
+
+
+def _along_rays(points: Floats, steps: Floats, centres: Floats) -> Floats:
     ray = points - centres
     with np.errstate(divide="ignore", invalid="ignore"):
         s = np.einsum("ni,ni->n", steps, ray) / np.einsum("ni,ni->n", ray, ray)
