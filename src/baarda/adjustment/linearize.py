@@ -56,7 +56,7 @@ class Arrangement:
         chosen, orders = [], []
         group: Any
         for group in groups:
-            order = np.arange(len(group))
+            order: Any = np.arange(len(group))
             if point_rank is not None and hasattr(group, "pieces"):
                 order = _sorted(point_rank[group.points], len(point_rank))
                 stretches = [] if network is None else group.by_optics(network)
@@ -232,7 +232,7 @@ class Rays:
             raise UsageError(f"{self.evaluation.group.name}: a distortion cannot be inverted")
 
 
-def _put(out: Floats, first: Ints, values: Floats) -> None:
+def _put(out: Floats, first: Ints | Small, values: Floats) -> None:
     """Store the (N, m) values of row blocks in their scalar rows."""
     for r, own in enumerate(values.T):
         out[first + r] = own

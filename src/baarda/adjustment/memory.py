@@ -20,7 +20,7 @@ from baarda.observations import Kind
 
 DOUBLE = 8
 TOLD_FROM = 0.5e9  # bytes
-MANY = 500_000  # observations from which it is worth the time to hand memory back
+MANY = 2_000_000  # observations from which it is worth the time to hand memory back
 
 
 def available() -> float:
@@ -85,7 +85,7 @@ def of_rows(unknowns: Unknowns, groups: Sequence[Kind], network: Network) -> flo
     scalars = [len(g) * len(g.components) for g in groups]
     evaluated = evaluated_groups(groups, network, unknowns)
     stored = sum(n for g, n in enumerate(scalars) if g not in evaluated)
-    return float(DOUBLE * (sum(scalars) * 12 + stored * width) + DOUBLE * unknowns.count * 12)
+    return float(DOUBLE * (sum(scalars) * 10 + stored * width) + DOUBLE * unknowns.count * 12)
 
 
 def of_dense(unknowns: Unknowns) -> float:
@@ -101,7 +101,7 @@ def of_fronts(structure: Structure) -> float:
         return 0.0
     waiting = np.sort((sizes - pivots) ** 2)[::-1]
     depth = int(np.ceil(np.log2(len(sizes) + 1))) + 2
-    return float(DOUBLE * ((sizes * pivots).sum() + (pivots**2).sum() + 3.0 * sizes.max() ** 2 + 2.0 * waiting[:depth].sum()))
+    return float(DOUBLE * ((sizes * pivots).sum() + 3.0 * sizes.max() ** 2 + 2.0 * waiting[:depth].sum()))
 
 
 def check(needed: float, what: str, tell: Callable[[str], None] | None) -> None:

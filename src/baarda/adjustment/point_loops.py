@@ -284,10 +284,10 @@ def _accumulate(clusters: Ints, front: Floats, y: Floats, rhs: Floats, b: Any, r
                 front[fx, cluster_rows[offset + x2]] += own[x * width + x2]
 
 
-def _statistics(clusters: Ints, z: Floats, b: Any, hat: Floats, points: Floats, size: Ints) -> None:
-    """Store the diagonal blocks of A N^-1 A', or only their diagonals, and the cofactors (P, 3, 3) of points.
+def _statistics(clusters: Ints, z: Floats, b: Any, hat: Floats, points: Floats, place: Ints, size: Ints) -> None:
+    """Store the diagonal blocks of A N^-1 A', or only their diagonals, and in their places the cofactors of the points of clusters.
 
-    They come from the inverse z of the front of their clusters.
+    They come from the inverse z of the front of the clusters.
     """
     table, first_block, chunk, row, first_point, first_column = b.table, b.first_block, b.chunk, b.row, b.first_point, b.first_column
     values, starts, prior = b.values, b.starts, b.prior
@@ -393,7 +393,7 @@ def _statistics(clusters: Ints, z: Floats, b: Any, hat: Floats, points: Floats, 
                         for x in range(3):
                             for x2 in range(3):
                                 total += inner[a, x] * core[x, x2] * inner[a2, x2]
-                        points[p, a, a2] = total * point_inverse[p, a] * point_inverse[p, a2]
+                        points[place[p], a, a2] = total * point_inverse[p, a] * point_inverse[p, a2]
                 n = begin_q
                 for i in range(first_block[p], first_block[p + 1]):
                     k = chunk[i]

@@ -472,11 +472,11 @@ def _rest(c: Chunk, hat: Floats, some: slice) -> Floats:
     return np.asarray((np.eye(c.m) if c.controlled is None else c.controlled[some]) - hat[some])
 
 
-def _quadratic(inverse: Floats, rest: Floats) -> Floats:
+def _quadratic(inverse: Any, rest: Floats) -> Floats:
     """Return the diagonals (n, m) of L^-T R L^-1."""
-    return np.einsum("nij,nji->ni", inverse.transpose(0, 2, 1) @ rest, inverse)
+    return np.asarray(np.einsum("nij,nji->ni", inverse.transpose(0, 2, 1) @ rest, inverse))
 
 
-def _squares(inverse: Floats) -> Floats:
+def _squares(inverse: Any) -> Floats:
     """Return the diagonals (n, m) of L^-T L^-1."""
-    return np.einsum("nji,nji->ni", inverse, inverse)
+    return np.asarray(np.einsum("nji,nji->ni", inverse, inverse))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from baarda.adjustment import lapack
 from baarda.adjustment.linear_system import Linearization
 from baarda.adjustment.row_blocks import hats_of, put_hat, scaled_rows, with_partials
-from baarda.adjustment.structure import Front, Structure
+from baarda.adjustment.structure import Front, Run, Structure
 from baarda.adjustment.workers import run_tree
 from baarda.errors import UsageError
 
@@ -57,7 +57,8 @@ def selected_inverse(solver: BlockSolver, whole: bool) -> Statistics:
     places, size = hats_of(lin, whole)
     hat, blocks = np.zeros(size), solver.blocks_._replace(hat=places)
     nodes = NodeBlocks(structure, solver.inverse)
-    points = np.zeros((len(structure.points), 3, 3))
+    columns = lin.unknowns["point"].columns.reshape(-1, 3)
+    points = np.zeros((len(columns), 3, 3))
     inverses: dict[int, Floats] = {}
     left, lock = [len(f.children) for f in structure.fronts], threading.Lock()
     rest: dict[int, list[tuple[int, Ints, Ints]]] = {}
@@ -87,11 +88,15 @@ def selected_inverse(solver: BlockSolver, whole: bool) -> Statistics:
             z[:p, :p] = 0.5 * (z[:p, :p] + z[:p, :p].T)
         finish(f, z, p)
 
+    def use(run: Run, z: Floats) -> None:
+        arrays = with_partials(blocks, lin, run.spans)
+        solver.loops.statistics(run.clusters, z, arrays, hat, points, structure.points, solver.size)
+
     def finish(f: int, z: Floats, p: int) -> None:
         """Use the inverse of a front, its first p columns its own."""
         front = structure.fronts[f]
         for run in structure.runs_of_fronts[f]:
-            solver.loops.statistics(run.clusters, z, with_partials(blocks, lin, run.spans), hat, points, solver.size)
+            use(run, z)
         for chunk, rows, at in rest.get(f, ()):
             _rest_hat(lin, solver.inverse, places, z, chunk, rows, at, hat)
         nodes.keep(f, z, p)
@@ -107,7 +112,7 @@ def selected_inverse(solver: BlockSolver, whole: bool) -> Statistics:
     before = [int(f.parent >= 0) for f in reversed(fronts)]  # from the root to the leaves
     run_tree(before, _children_backwards(fronts), lambda i: invert(len(fronts) - 1 - i), lin.workers)
     for run in structure.runs_of_fronts[-1]:
-        solver.loops.statistics(run.clusters, np.zeros((0, 0)), with_partials(blocks, lin, run.spans), hat, points, solver.size)
+        use(run, np.zeros((0, 0)))
     for f, entries in rest.items():
         if f < 0:
             for chunk, rows, at in entries:
@@ -116,19 +121,11 @@ def selected_inverse(solver: BlockSolver, whole: bool) -> Statistics:
     for (begin, each), c in zip(places, lin.chunks, strict=True):
         shape = (-1, c.m, c.m) if whole or not c.plain else (-1, c.m)
         hats.append(hat[begin : begin + each * len(c.first)].reshape(shape))
-    return Statistics(hats, whole, _all_points(solver, points, nodes), nodes)
-
-
-def _all_points(solver: BlockSolver, points: Floats, nodes: NodeBlocks) -> Floats:
-    """Return the cofactors of all points of the network from those of the inner points, and of the nodes."""
-    columns = solver.lin.unknowns["point"].columns.reshape(-1, 3)
-    out = np.zeros((len(columns), 3, 3))
-    out[solver.structure.points] = points
-    others = np.ones(len(columns), dtype=bool)
-    others[solver.structure.points] = False
-    out[others] = nodes(columns[others])
-    out.flags.writeable = False
-    return out
+    others = np.ones(len(points), dtype=bool)
+    others[structure.points] = False
+    points[others] = nodes(columns[others])
+    points.flags.writeable = False
+    return Statistics(hats, whole, points, nodes)
 
 
 def _rest_hat(lin: Linearization, inverse: Floats, places: Ints, z: Floats, chunk: int, rows: Ints, at: Ints, hat: Floats) -> None:

@@ -130,7 +130,8 @@ def standardised(
     if seen.all():
         w = np.asarray(np.sqrt(q))
         w *= sigma0
-        return np.divide(v, w, out=w)
+        np.divide(v, w, out=w)
+        return w
     w = np.full(v.shape, np.nan)
     np.divide(v, sigma0 * np.sqrt(np.where(seen, q, 1.0)), out=w, where=seen)
     return w
