@@ -8,12 +8,14 @@ from scipy import linalg
 
 import baarda
 from baarda import cameras
+from baarda.adjustment import memory
 from baarda.adjustment.linearize import linearize, whitened_misclosures
 from baarda.adjustment.solve import Settings, active_groups, prepare
 from baarda.cameras import FIXED, FREE, OBSERVED
 from baarda.errors import DatumDefect, RedundancyNotPositive, Singular, UsageError
 from baarda.network import Images, Network, Points, State, unknowns_of
 from baarda.observations import Distances, ImagePoints
+from baarda.procedures.synthetic import synthetic
 from networks import BROWN, FREE_BROWN, ring, with_distances
 
 
@@ -416,3 +418,28 @@ def test_weights_do_not_change_the_datum_defect():
         assert find_defect(lin, state).count == 0
     with pytest.raises(Singular, match="sigmas are too different"):
         baarda.adjust(n, image_sigma=1e-10)
+
+
+# ---- memory ----
+def test_equal_standard_deviations_are_one_number():
+    network = synthetic("ring", images=5, points=30, seed=3, control_sigma=0.0).network
+    one, two = (baarda.adjust(network, image_sigma=s) for s in (1.0, 2.0))
+    assert one.sigmas.strides == (0,)
+    assert one.sigmas.shape == (one.count,)
+    assert (two.sigmas == 2.0).all()
+    np.testing.assert_array_equal(one.qvv, one.redundancy_numbers)
+    np.testing.assert_allclose(two.qvv, 4.0 * two.redundancy_numbers, rtol=1e-15)
+    np.testing.assert_allclose(two.redundancy_numbers, one.redundancy_numbers, rtol=1e-9)
+
+
+def test_start_values_are_those_of_the_source():
+    network = synthetic("ring", images=5, points=30, seed=3).network
+    result = baarda.adjust(network)
+    np.testing.assert_array_equal(result.start.points.coordinates, network.points.coordinates)
+    np.testing.assert_array_equal(result.network.points.given, network.points.given)
+    np.testing.assert_array_equal(result.network.offset, network.offset)
+
+
+def test_memory_can_be_handed_back_at_any_size():
+    memory.release(0)
+    memory.release(memory.MANY)

@@ -354,6 +354,42 @@ def test_a_part_of_a_larger_network(name, loops, clusters):
         assert np.abs(part.blocks(nodes) - whole.blocks(nodes)).max() <= tolerance * size.max()
 
 
+@pytest.mark.parametrize("name", list(NETWORKS))
+def test_diagonals_of_hats_are_handed_over(name, loops):
+    """Without correlations only diagonals are stored, the same to the last bit; they can be had again, and the blocks too."""
+    s = system(NETWORKS[name]())
+    solver, other = BlockSolver.of(s.lin, s.pattern, s.held), BlockSolver.of(s.lin, s.pattern, s.held)
+    first, again, whole, after = solver.hat(whole=False), solver.hat(whole=False), solver.hat(), solver.hat(whole=False)
+    assert [h.ndim == 2 for h in first] == [c.plain for c in s.lin.chunks]
+    assert all(c.plain for c in s.lin.chunks) == ("correlated" not in name)
+    for c, a, b, h, d in zip(s.lin.chunks, first, again, whole, after, strict=True):
+        assert h.shape == (len(c.first), c.m, c.m)
+        for found in (a, b, d):
+            np.testing.assert_array_equal(found, np.einsum("nii->ni", h) if c.plain else h)
+    for a, b in zip(whole, other.hat(), strict=True):
+        np.testing.assert_array_equal(a, b)
+    for a, b in zip(DenseSolver.of(s.lin, s.held).hat(whole=False), first, strict=True):
+        assert a.shape == b.shape
+
+
+def test_blocks_of_the_inverse_are_of_one_node():
+    s = system(NETWORKS["aerial"]())
+    solver = BlockSolver.of(s.lin, s.pattern, s.held)
+    images = s.lin.unknowns["image"].columns.reshape(-1, 6)
+    np.testing.assert_array_equal(solver.blocks(images[:, [4, 0]]), solver.blocks(images)[:, [4, 0]][:, :, [4, 0]])
+    with pytest.raises(baarda.errors.UsageError, match="of one node"):
+        solver.blocks(images[:2].reshape(1, -1))
+
+
+def test_points_in_any_order_and_choice():
+    s = system(NETWORKS["joined points"]())
+    solver = BlockSolver.of(s.lin, s.pattern, s.held)
+    columns = s.lin.unknowns["point"].columns.reshape(-1, 3)
+    every = solver.blocks(columns)
+    np.testing.assert_array_equal(solver.blocks(columns[::-2]), every[::-2])
+    np.testing.assert_array_equal(solver.blocks(columns[:, [2, 0]]), every[:, [2, 0]][:, :, [2, 0]])
+
+
 def test_all_cameras_known(loops):
     """Without nodes there is nothing to reduce to: points alone."""
     network = made("ring", images=5, points=20)

@@ -36,7 +36,7 @@ def blocks(m: int, sparse: bool) -> tuple[Blocks, np.ndarray, np.ndarray]:
         first_block=np.arange(POINTS + 1) * RAYS, chunk=np.zeros(count, dtype=np.int32), row=np.arange(count, dtype=np.int32),
         first_point=first_point, first_column=np.array([0, total, 2 * total]), cluster_rows=rows.astype(np.int32),
         cluster_columns=rows.astype(np.intp), sparse=np.array([sparse, sparse]), inverse=inverse,
-        point_inverse=rng.uniform(0.5, 2.0, (POINTS, 3)), prior=np.full((POINTS, 3), 0.1), hat=np.array([0, count * m * m]),
+        point_inverse=rng.uniform(0.5, 2.0, (POINTS, 3)), prior=np.full((POINTS, 3), 0.1), hat=np.array([[0, m * m]]),
         scalar=np.arange(count) * m,
     )  # fmt: skip
     structure = SimpleNamespace(
@@ -82,14 +82,18 @@ def test_reduced_matrix_and_right_hand_sides(m, sparse):
     np.testing.assert_allclose(again, expected, atol=1e-12 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("whole", [True, False])
 @pytest.mark.parametrize(("m", "sparse"), CASES)
-def test_statistics(m, sparse):
+def test_statistics(m, sparse, whole):
     b, size, _ = blocks(m, sparse)
+    each = m * m if whole else m
+    b = b._replace(hat=np.array([[0, each]]))
+    place = np.random.default_rng(9).permutation(POINTS)
     root = np.random.default_rng(8).normal(size=(FRONT, FRONT))
     found = []
     for loop in (kernels.compiled().statistics, twins.statistics):
-        hat, points = np.zeros(int(b.hat[-1])), np.zeros((POINTS, 3, 3))
-        loop(np.arange(2), root @ root.T, b, hat, points, size)
+        hat, points = np.zeros(POINTS * RAYS * each), np.zeros((POINTS, 3, 3))
+        loop(np.arange(2), root @ root.T, b, hat, points, place, size)
         found.append((hat, points))
     for ours, theirs in zip(*found, strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-11 * np.abs(theirs).max())

@@ -20,9 +20,10 @@ from baarda.adjustment import lapack
 from baarda.adjustment.dense import refuse_null_space
 from baarda.adjustment.kernels import Kernels, kernels
 from baarda.adjustment.linear_system import Linearization
+from baarda.adjustment.memory import release
 from baarda.adjustment.pairs import pairs
 from baarda.adjustment.row_blocks import Blocks, blocks_of, scaled_rows, sizes, table_of, with_partials
-from baarda.adjustment.selected_inverse import NodeBlocks, selected_inverse
+from baarda.adjustment.selected_inverse import Statistics, selected_inverse
 from baarda.adjustment.structure import Front, Run, Structure
 from baarda.adjustment.workers import for_each, run_tree
 from baarda.errors import Singular, UsageError
@@ -126,6 +127,7 @@ class BlockSolver:
             border = updates[len(structure.fronts) - 1]
             border = np.tril(border) + np.tril(border, -1).T
         done = tuple(p for p in panels if p is not None)
+        release(lin.count)  # what the fronts took
         rhs = _added(structure, range(len(shares)), shares) if loops.compiled else None
         return BlockSolver(lin, structure, inverse, arrays, loops, triangles, done, size, rhs, border)
 
@@ -375,22 +377,38 @@ class BlockSolver:
         return float(1.0 / (norms[0] * norms[1]))
 
     # ---- statistics ----
-    def hat(self) -> list[Floats]:
-        """Return for each chunk the (N, m, m) diagonal blocks of A N^-1 A'."""
-        return list(self._statistics[0])
+    def hat(self, whole: bool = True) -> list[Floats]:
+        """Return for each chunk the (N, m, m) diagonal blocks of A N^-1 A'.
+
+        Without `whole` only their diagonals (N, m) for plain chunks; these are handed over, so that they need not be kept twice.
+        """
+        last = self._last
+        if not last or last[0].hats is None or (whole and not last[0].whole):
+            last[:] = [self._selected(whole)]
+        hats = last[0].hats or []
+        if not whole and last[0].whole:
+            return [np.einsum("nii->ni", h) if c.plain else h for c, h in zip(self.lin.chunks, hats, strict=True)]
+        if not whole:
+            last[0] = last[0]._replace(hats=None)
+        return hats
 
     def blocks(self, columns: Ints) -> Floats:
         """Return the (N, w, w) blocks of N^-1 for (N, w) columns: each of one node of the reduced system, or of one point."""
-        _, points, nodes = self._statistics
+        if not self._last:
+            self._last.append(self._selected(whole=False))
+        points, nodes = self._last[0].points, self._last[0].nodes
+        every = self.lin.unknowns["point"].columns.reshape(-1, 3)
+        if np.array_equal(columns, every):
+            return points
         own = self.structure.point_columns
-        point, axis = np.full(len(self.inverse), -1), np.zeros(len(self.inverse), dtype=np.intp)
-        point[own] = np.arange(len(own))[:, None]
+        point, axis = np.full(len(self.inverse), -1, dtype=np.int32), np.zeros(len(self.inverse), dtype=np.int8)
+        point[own] = self.structure.points[:, None]
         axis[own] = np.arange(3)
         point[-1] = -1
         where = point[columns].max(axis=1, initial=-1)
         out = np.zeros((*columns.shape, columns.shape[1]))
         inner = np.flatnonzero(where >= 0)
-        if np.array_equal(columns[inner], own[where[inner]]):  # whole points: zero where a coordinate is fixed
+        if np.array_equal(columns[inner], every[where[inner]]):  # whole points: zero where a coordinate is fixed
             out[inner] = points[where[inner]]
         else:
             at, free = axis[columns[inner]], columns[inner] >= 0
@@ -405,10 +423,14 @@ class BlockSolver:
         return pairs(self, a, b)
 
     @cached_property
-    def _statistics(self) -> tuple[list[Floats], Floats, NodeBlocks]:
+    def _last(self) -> list[Statistics]:
+        """The statistics, once computed."""
+        return []
+
+    def _selected(self, whole: bool) -> Statistics:
         if self.structure.border and self.border_inverse is None:
             raise UsageError("a part of a larger network needs the cofactors of its border")
-        return selected_inverse(self)
+        return selected_inverse(self, whole)
 
 
 def _added(structure: Structure, fronts: Sequence[int], shares: list[Floats]) -> Floats:

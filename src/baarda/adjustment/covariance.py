@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baarda.adjustment.datum import Datum
+from baarda.adjustment.linear_system import PIECE
 from baarda.adjustment.solver import Solver
 
 Floats = NDArray[np.float64]
@@ -49,9 +50,13 @@ class Cofactors:
 
     def blocks(self, columns: Ints) -> Floats:
         """Return the (N, w, w) diagonal blocks of Q for (N, w) columns, as a solver's `blocks`."""
-        out = self.solver.blocks(columns)
+        found = self.solver.blocks(columns)
         if self._inner is None:
-            return out
-        t, k, c = (self._inner[0][columns], self._inner[1][columns], self._inner[2])
-        mixed = t @ k.transpose(0, 2, 1)
-        return np.asarray(out - mixed - mixed.transpose(0, 2, 1) + t @ c @ t.transpose(0, 2, 1))
+            return found
+        out = np.empty_like(found)
+        for begin in range(0, len(columns), PIECE):
+            some = slice(begin, begin + PIECE)
+            t, k, c = (self._inner[0][columns[some]], self._inner[1][columns[some]], self._inner[2])
+            mixed = t @ k.transpose(0, 2, 1)
+            out[some] = found[some] - mixed - mixed.transpose(0, 2, 1) + t @ c @ t.transpose(0, 2, 1)
+        return out

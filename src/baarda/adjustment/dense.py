@@ -58,14 +58,15 @@ class DenseSolver:
         x = self.solve(self.lin.transposed(y))
         return x, self.lin.times(x)
 
-    def hat(self) -> list[Floats]:
-        """Return for each chunk the (N, m, m) diagonal blocks of A N^-1 A'."""
+    def hat(self, whole: bool = True) -> list[Floats]:
+        """Return for each chunk the (N, m, m) diagonal blocks of A N^-1 A'; without `whole` only their diagonals (N, m) if it is plain."""
         inverse = self._inverse
         out = []
         for c in self.lin.chunks:
             at = self.place[np.concatenate([p.columns for p in c.parts], axis=1)]
             jacobian = np.concatenate(c.partials(), axis=2)
-            out.append(np.asarray(jacobian @ inverse[at[:, :, None], at[:, None, :]] @ jacobian.transpose(0, 2, 1)))
+            hat = np.asarray(jacobian @ inverse[at[:, :, None], at[:, None, :]] @ jacobian.transpose(0, 2, 1))
+            out.append(hat if whole or not c.plain else np.einsum("nii->ni", hat).copy())
         return out
 
     def blocks(self, columns: Ints) -> Floats:

@@ -15,7 +15,7 @@ from baarda.adjustment.linearize import Arrangement, linearize, whitened_misclos
 from baarda.adjustment.result import Iteration
 from baarda.adjustment.solver import Solver
 from baarda.errors import Singular
-from baarda.network import Network, State
+from baarda.network import Network, State, Viewpoints
 from baarda.observations import viewpoints_of
 
 if TYPE_CHECKING:
@@ -145,6 +145,7 @@ def iterate(
     datum: Datum,
     factor: Callable[..., Solver],
     settings: Settings,
+    viewpoints: Viewpoints | None = None,
 ) -> tuple[State, Linearization, list[Iteration], bool]:
     """Gauss-Newton with Levenberg's damping where a full step does not help.
 
@@ -156,7 +157,7 @@ def iterate(
     control = Control(float(lin.misclosure @ lin.misclosure), lin.count, settings, settings.progress)
     before: Floats | None = None  # the last full step, as a change of the observations
     straight = False  # whether the last step was neither damped nor bent nor lengthened
-    viewpoints, largest = viewpoints_of(groups.groups, state), lin.scale
+    viewpoints, largest = viewpoints or viewpoints_of(groups.groups, state), lin.scale
     far = bool(viewpoints.far(state.points).any())
 
     def moved(step: Floats) -> State:
@@ -170,11 +171,8 @@ def iterate(
         largest = np.maximum(largest, lin.scale)
         return replace(lin, near=largest)
 
-    def misclosures(step: Floats) -> tuple[State, Floats, float]:
-        trial = moved(step)
-        values = whitened_misclosures(network, trial, groups, workers)
-        with np.errstate(over="ignore"):
-            return trial, values, float(values @ values) if np.isfinite(values).all() else np.inf
+    def misclosures(there: State) -> Floats:
+        return whitened_misclosures(network, there, groups, workers)
 
     tied, unknowns, workers = datum, lin.unknowns, lin.workers
     untied = replace(datum, held=np.zeros(0, dtype=np.intp), conditions=None)  # damping ties the datum down by itself
@@ -201,24 +199,24 @@ def iterate(
             step, plain = lengthened * step, straight and lengthened == 1.0
         predicted = 2.0 * lengthened * float(change @ lin.misclosure) - lengthened**2 * squares
         if lengthened == 1.0 and control.bends(relative):
-            step, plain, bent = _bent(lin, solver, datum, step, change, lambda x: misclosures(x)[1]), False, True
-        near = control.near(relative)
+            step, plain, bent = _bent(lin, solver, datum, step, change, lambda x: misclosures(moved(x))), False, True
+        near, full, trial = control.near(relative), control.damping == 0.0, moved(step)
+        before = change if full and lengthened == 1.0 else None
+        del change  # its memory is needed, and that of the system
         if near:  # linearised at once
-            trial, solver, scale = moved(step), solver.at(None), lin.scale
-            del lin  # its memory is needed
+            solver, scale = solver.at(None), lin.scale
+            del lin
             lin = linearized(trial, scale)
-            with np.errstate(over="ignore"):
-                value = float(lin.misclosure @ lin.misclosure)
+            value = _squares(lin.misclosure)
         else:
-            trial, _, value = misclosures(step)
-        full = control.damping == 0.0
+            value = _squares(misclosures(trial))
         if not control.takes(value, predicted, relative):
             before, solver, straight = None, None, False
             if near:
                 lin = linearized(state, scale)
             continue
         state = trial
-        before, straight = change if full and lengthened == 1.0 else None, full and lengthened == 1.0 and not bent
+        straight = before is not None and not bent
         solver = solver.at(None) if full and relative <= REUSE else None
         if not near:
             scale = lin.scale
@@ -228,6 +226,12 @@ def iterate(
             return state, lin, control.history, True
         control.relax(relative)
     return state, lin, control.history, False
+
+
+def _squares(values: Floats) -> float:
+    """Return the sum of squares, infinite where a number is not finite."""
+    with np.errstate(over="ignore"):
+        return float(values @ values) if np.isfinite(values).all() else np.inf
 
 
 def _step(lin: Linearization, solver: Solver, datum: Datum, y: Floats) -> tuple[Floats, Floats]:
@@ -250,7 +254,11 @@ def _bent(
 ) -> Floats:
     """Add the second-order correction to a step, where it is smaller than the step."""
     h = 0.1
-    curvature = 2.0 / h * ((lin.misclosure - misclosures(h * step)) / h - change)
+    curvature = misclosures(h * step)  # 2 ((l - l(h)) / h - change) / h, in place
+    np.subtract(lin.misclosure, curvature, out=curvature)
+    curvature /= h
+    curvature -= change
+    curvature *= 2.0 / h
     if not np.isfinite(curvature).all():
         return step
     bend = -0.5 * _step(lin, solver, datum, curvature)[0]

@@ -18,6 +18,7 @@ from baarda.network import UnknownGroup, Unknowns
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+Small = NDArray[np.int32]
 
 PIECE = 4096  # row blocks handled by one task
 SHARES = 4  # tasks that need memory of their own
@@ -33,7 +34,7 @@ class Part:
     """
 
     group: UnknownGroup
-    nodes: Ints
+    nodes: Small
     positions: Ints
     jacobian: Floats
     start: int
@@ -52,28 +53,39 @@ class Part:
         """Return the (n, w) columns of some row blocks."""
         return np.asarray(self.group.columns[self.group.offsets[self.nodes[rows]][:, None] + self.positions])
 
+    def nodes_of(self, rows: slice) -> Small:
+        """Return the nodes of some row blocks one after the other in memory, as the loops are compiled for."""
+        return np.ascontiguousarray(self.nodes[rows])
+
     @cached_property
     def table(self) -> Ints:
         """The (nodes, w) columns of all nodes of the group; of no meaning for nodes of another width."""
+        width = len(self.positions)
+        if width and len(self.group.columns) == width * len(self.group.labels) and (np.diff(self.group.offsets) == width).all():
+            return self.group.columns.reshape(-1, width)  # all are kept of all: no copy
         last = max(len(self.group.columns) - 1, 0)
         return np.asarray(self.group.columns[np.minimum(self.group.offsets[:-1, None] + self.positions, last)])
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Whitened row blocks: first scalar row (N,), misclosures (N, m), parts, and the factors L (N, m, m) of the cofactors Q = L L'.
+    """Whitened row blocks of m rows: first scalar row (N,), parts, and the factors L (N, m, m) of the cofactors Q = L L'.
 
     Of a combined model with fewer conditions than observations, `controlled` (N, m, m) projects onto what the conditions control. The
     partials of large groups, which would take more memory than all the rest, are not stored: `evaluate` writes those of some row blocks
     (a slice or indices) into an array, part after part.
     """
 
-    first: Ints
-    misclosure: Floats
+    first: Ints | Small
     parts: tuple[Part, ...]
     factor: Floats
     controlled: Floats | None = None
     evaluate: Callable[[Any, Floats], None] | None = None
+
+    @property
+    def m(self) -> int:
+        """The number of rows of a block."""
+        return int(self.factor.shape[1])
 
     @property
     def rows(self) -> Ints:
@@ -82,12 +94,12 @@ class Chunk:
 
     def rows_of(self, blocks: Any) -> Ints:
         """Return the (n, m) scalar rows of some row blocks."""
-        return np.asarray(self.first[blocks][:, None] + np.arange(self.misclosure.shape[1]))
+        return np.asarray(self.first[blocks][:, None] + np.arange(self.m))
 
     @property
     def per_block(self) -> int:
         """The number of partials of a row block."""
-        return int(self.misclosure.shape[1]) * sum(len(p.positions) for p in self.parts)
+        return self.m * sum(len(p.positions) for p in self.parts)
 
     def partials(self, rows: Any = slice(None)) -> list[Floats]:
         """Return the whitened partials (n, m, w) of each part at some row blocks, a slice or indices."""
@@ -96,13 +108,18 @@ class Chunk:
         n = len(range(*rows.indices(len(self.first)))) if isinstance(rows, slice) else len(rows)
         values = np.empty(n * self.per_block)
         self.evaluate(rows, values)
-        return split(values, n, self.misclosure.shape[1], [p.positions for p in self.parts])
+        return split(values, n, self.m, [p.positions for p in self.parts])
 
     @property
     def correlated(self) -> bool:
         """Whether rows of a block are correlated."""
         factor = self.factor[:1] if self.factor.strides[0] == 0 else self.factor
-        return factor.shape[1] > 1 and bool(np.any(np.tril(factor, -1)))
+        return any(bool(factor[:, i, j].any()) for i in range(self.m) for j in range(i))
+
+    @property
+    def plain(self) -> bool:
+        """Whether rows are uncorrelated and controlled in full, so that of their statistics only diagonals count."""
+        return self.controlled is None and not self.correlated
 
     def pieces(self) -> list[slice]:
         """Return slices of row blocks that one task handles."""
@@ -137,6 +154,11 @@ def split(values: Floats, count: int, rows: int, positions: Sequence[Ints]) -> l
     return out
 
 
+def small(numbers: Ints, bound: int) -> Ints | Small:
+    """Return whole numbers below a bound in 32 bits where they fit."""
+    return numbers.astype(np.int32) if bound <= np.iinfo(np.int32).max else numbers
+
+
 @dataclass(frozen=True)
 class Linearization:
     """The whitened linear system l + v = A x at one state.
@@ -145,8 +167,8 @@ class Linearization:
     ----------
     unknowns : Unknowns
     chunks : tuple of Chunk
-    count : int
-        Number n of scalar observations.
+    misclosure : (n,) array
+        The whitened misclosures of all scalar observations.
     values : array
         The stored partials of all chunks and parts, one after the other.
     workers : int or None
@@ -157,10 +179,15 @@ class Linearization:
 
     unknowns: Unknowns
     chunks: tuple[Chunk, ...]
-    count: int
+    misclosure: Floats
     values: Floats
     workers: int | None = None
     near: Floats | None = None
+
+    @property
+    def count(self) -> int:
+        """The number n of scalar observations."""
+        return len(self.misclosure)
 
     @property
     def stored(self) -> bool:
@@ -170,7 +197,7 @@ class Linearization:
     @cached_property
     def uncontrolled(self) -> int:
         """How many combinations of observations no condition controls: they have no redundancy."""
-        return round(sum(c.misclosure.size - float(np.einsum("nii->", c.controlled)) for c in self.chunks if c.controlled is not None))
+        return round(sum(len(c.first) * c.m - float(np.einsum("nii->", c.controlled)) for c in self.chunks if c.controlled is not None))
 
     def weighted(self, roots: Floats) -> Linearization:
         """Return the system with its rows multiplied by the roots of their weights, (n,).
@@ -187,24 +214,22 @@ class Linearization:
         for c in self.chunks:
             w = roots[c.rows]
             if c.evaluate is not None:
-                chunks.append(
-                    replace(c, misclosure=c.misclosure * w, evaluate=partial(_weighted, c.evaluate, [p.positions for p in c.parts], w))
-                )
+                chunks.append(replace(c, evaluate=partial(_weighted, c.evaluate, [p.positions for p in c.parts], w)))
                 continue
             parts = []
             for p in c.parts:
                 view = values[p.start : p.start + p.jacobian.size].reshape(p.jacobian.shape)
                 np.multiply(p.jacobian, w[:, :, None], out=view)
                 parts.append(replace(p, jacobian=view))
-            chunks.append(replace(c, misclosure=c.misclosure * w, parts=tuple(parts)))
-        return replace(self, chunks=tuple(chunks), values=values, near=None)
+            chunks.append(replace(c, parts=tuple(parts)))
+        return replace(self, chunks=tuple(chunks), misclosure=self.misclosure * roots, values=values, near=None)
 
     def sample(self, most: int) -> Linearization:
         """Return a part of the rows: at most some `most` row blocks of each chunk, those that end at a fixed parameter first.
 
         What is determined by these rows is determined by all.
         """
-        chunks, values, at, count = [], [], 0, 0
+        chunks, values, chosen, at, count = [], [np.zeros(0)], [np.zeros(0)], 0, 0
         for c in self.chunks:
             rows = np.arange(len(c.first))
             if len(rows) > most:
@@ -219,24 +244,13 @@ class Linearization:
                 values.append(np.ascontiguousarray(jacobian))
                 parts.append(replace(p, nodes=p.nodes[rows], jacobian=values[-1], start=at))
                 at += values[-1].size
-            m = c.misclosure.shape[1]
             controlled = None if c.controlled is None else c.controlled[rows]
-            chunks.append(Chunk(count + m * np.arange(len(rows)), c.misclosure[rows], tuple(parts), c.factor[rows], controlled))
-            count += m * len(rows)
-        joined = np.concatenate([np.zeros(0), *(v.ravel() for v in values)])
-        return Linearization(self.unknowns, tuple(chunks), count, joined, self.workers)
-
-    @cached_property
-    def misclosure(self) -> Floats:
-        """The whitened misclosures, (n,)."""
-        out = np.empty(self.count)
-
-        def put(c: Chunk, some: slice) -> None:
-            for r, own in enumerate(c.misclosure[some].T):
-                out[c.first[some] + r] = own
-
-        self._each(put)
-        return out
+            first = small(count + c.m * np.arange(len(rows)), self.count)
+            chunks.append(Chunk(first, tuple(parts), c.factor[rows], controlled))
+            chosen.append(self.misclosure[c.rows_of(rows)].ravel())
+            count += c.m * len(rows)
+        joined = np.concatenate([v.ravel() for v in values])
+        return Linearization(self.unknowns, tuple(chunks), np.concatenate(chosen), joined, self.workers)
 
     @cached_property
     def design(self) -> Any:
@@ -269,7 +283,7 @@ class Linearization:
         def product(c: Chunk, some: slice) -> None:
             for part, jacobian in zip(c.parts, c.partials(some), strict=True):
                 if kinds is None or part.kind in kinds:
-                    multiply(jacobian, part.nodes[some], part.table, padded, c.first[some], out)
+                    multiply(jacobian, part.nodes_of(some), part.table, padded, c.first[some], out)
 
         self._each(product)
         return out
@@ -280,10 +294,9 @@ class Linearization:
         out = np.zeros(self.count)
 
         def sums(c: Chunk, some: slice) -> None:
-            m = c.misclosure.shape[1]
             pairs = zip(c.parts, c.partials(some), strict=True)
             total = sum(np.einsum("nmw,nmw,nw->nm", jacobian, jacobian, padded[p.columns_of(some)]) for p, jacobian in pairs)
-            out[c.first[some][:, None] + np.arange(m)] = total
+            out[c.rows_of(some)] = total
 
         self._each(sums)
         return out
@@ -312,9 +325,9 @@ class Linearization:
                     if kinds is not None and part.kind not in kinds:
                         continue
                     if y.ndim == 1:
-                        loops.gathered(jacobian, part.nodes[some], part.table, y, c.first[some], squared, own)
+                        loops.gathered(jacobian, part.nodes_of(some), part.table, y, c.first[some], squared, own)
                     else:
-                        loops.gathered_many(jacobian, part.nodes[some], part.table, y, c.first[some], own)
+                        loops.gathered_many(jacobian, part.nodes_of(some), part.table, y, c.first[some], own)
             return own
 
         out = np.zeros((self.unknowns.count + 1, *y.shape[1:]))

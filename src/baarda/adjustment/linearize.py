@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from baarda.adjustment.linear_system import PIECE, Chunk, Linearization, Part, split
+from baarda.adjustment.linear_system import PIECE, Chunk, Linearization, Part, small, split
 from baarda.adjustment.workers import for_each, scratch
 from baarda.errors import InputError, UsageError
 from baarda.network import Network, State, UnknownGroup, Unknowns
@@ -20,6 +20,7 @@ from baarda.observations.image_points import CHUNK, Evaluation, Piece
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+Small = NDArray[np.int32]
 
 
 EVALUATED_FROM = 100_000  # rows of a group whose partials are evaluated wherever they are needed, not stored
@@ -34,7 +35,7 @@ class Arrangement:
     Attributes
     ----------
     groups, sorted : tuples of observation groups
-    orders : tuple of int arrays
+    orders : tuple of int32 or int arrays
         The rows of each sorted group in the source's group.
     ranked : bool
         Whether there was a rank to sort by.
@@ -42,7 +43,7 @@ class Arrangement:
 
     groups: tuple[Kind, ...]
     sorted: tuple[Kind, ...]
-    orders: tuple[Ints, ...]
+    orders: tuple[Ints | Small, ...]
     ranked: bool = False
 
     @staticmethod
@@ -55,7 +56,7 @@ class Arrangement:
         chosen, orders = [], []
         group: Any
         for group in groups:
-            order = np.arange(len(group))
+            order: Any = np.arange(len(group))
             if point_rank is not None and hasattr(group, "pieces"):
                 order = _sorted(point_rank[group.points], len(point_rank))
                 stretches = [] if network is None else group.by_optics(network)
@@ -64,7 +65,7 @@ class Arrangement:
                     for i, (_, rows) in enumerate(stretches):
                         kind[rows] = i
                     order = order[np.argsort(kind[order], kind="stable")]
-                group = group.selected(order)
+                group = _in_order(group, order)
             chosen.append(group)
             orders.append(order)
         return Arrangement(tuple(groups), tuple(chosen), tuple(orders), point_rank is not None)
@@ -75,9 +76,16 @@ class Arrangement:
         return offsets_of(self.groups)
 
     @cached_property
-    def first(self) -> tuple[Ints, ...]:
+    def first(self) -> tuple[Ints | Small, ...]:
         """First scalar row of each row of the sorted groups."""
-        return tuple(self.offsets[g] + order * len(self.groups[g].components) for g, order in enumerate(self.orders))
+        ends = enumerate(self.orders)
+        return tuple(small(self.offsets[g] + order * len(self.groups[g].components), self.offsets[-1]) for g, order in ends)
+
+
+def _in_order(group: Any, order: Ints | Small) -> Any:
+    """Return image points in another order, the numbers of their images and points in 32 bits."""
+    numbers = {key: small(getattr(group, key), np.iinfo(np.int32).max) for key in ("images", "points")}
+    return replace(group, **numbers).selected(order)
 
 
 def offsets_of(groups: Sequence[Kind]) -> Ints:
@@ -108,6 +116,7 @@ def linearize(
     """
     arranged = groups if isinstance(groups, Arrangement) else Arrangement.of(groups)
     kept = unknowns.kept
+    misclosure = np.empty(int(arranged.offsets[-1]))
     fillings: list[_Filling | Chunk] = []
     large = evaluated_groups(arranged.sorted, network, unknowns) if arranged.ranked else set()
     group: Any
@@ -115,7 +124,7 @@ def linearize(
         first = arranged.first[g]
         if g in large:  # a chunk for each optics, however its partials are had
             for optics, rows in group.by_optics(network):
-                chunk = _evaluated(group, optics, rows, first, network, state, unknowns, kept, workers)
+                chunk = _evaluated(group, optics, rows, first, misclosure, network, state, unknowns, kept, workers)
                 pieces = [Piece(optics, rows[a : a + CHUNK]) for a in range(0, len(rows), CHUNK)]
                 fillings.append(chunk or _planned(group, pieces, first, network, state, unknowns, kept))
         elif hasattr(group, "pieces"):
@@ -131,17 +140,17 @@ def linearize(
     chunks = []
     for f in fillings:
         if isinstance(f, _Filling):
-            f.fill(values, start, workers)
+            f.fill(values, start, misclosure, workers)
             start += f.size
         chunks.append(f.chunk() if isinstance(f, _Filling) else f)
-    return Linearization(unknowns, tuple(chunks), int(arranged.offsets[-1]), values, workers)
+    return Linearization(unknowns, tuple(chunks), misclosure, values, workers)
 
 
-def _sorted(keys: Ints, count: int) -> Ints:
+def _sorted(keys: Ints, count: int) -> Ints | Small:
     """Return the stable order of keys below a number: counted, which is faster than sorted."""
     n = len(keys)
     ones = np.ones(n, dtype=np.int8)
-    return np.asarray(sparse.csr_array((ones, (keys, np.arange(n))), shape=(count, n)).indices, dtype=np.intp)
+    return np.asarray(sparse.csr_array((ones, (keys, np.arange(n))), shape=(count, n)).indices)
 
 
 def evaluated_groups(groups: Sequence[Kind], network: Network, unknowns: Unknowns) -> set[int]:
@@ -169,26 +178,31 @@ def _can_be_evaluated(group: Any, network: Network) -> bool:
 
 
 def _evaluated(
-    group: Any, optics: Any, rows: Ints, first: Ints, network: Network, state: State, unknowns: Unknowns, kept: Any, workers: int | None
-) -> Chunk | None:
-    """Return a chunk whose partials are evaluated wherever they are needed; None where a distortion is not inverted by the loop."""
+    group: Any, optics: Any, rows: Ints, first: Any, misclosure: Floats, network: Network, state: State, unknowns: Unknowns, kept: Any,
+    workers: int | None,
+) -> Chunk | None:  # fmt: skip
+    """Return a chunk whose partials are evaluated wherever they are needed, and store its misclosures (n,) in their rows.
+
+    None where a distortion is not inverted by the loop.
+    """
     some, evaluation = slice(int(rows[0]), int(rows[-1]) + 1), group.evaluation(optics, network, state)
     count = some.stop - some.start
     if evaluation is None or count != len(rows):
         return None
     width = {"camera": len(optics.model.order), "image": 6, "point": 3}
     positions = [kept.get(key, np.zeros(0, dtype=np.intp)) for key in width.items()]
-    misclosure = np.empty((count, 2))
     rays = Rays(evaluation, some.start, count, tuple(positions))
     pieces = [slice(a, min(a + PIECE, count)) for a in range(0, count, PIECE)]
-    if not all(for_each(pieces, partial(rays.misclosures, misclosure), workers)):
+    if not all(for_each(pieces, partial(rays.misclosures, first[some], misclosure), workers)):
         return None
-    nodes = (network.images.cameras[group.images[some]], group.images[some], group.points[some])
+    cameras = np.unique(network.images.cameras)
+    camera = cameras[0] if len(cameras) == 1 else network.images.cameras[group.images[some]]
+    nodes = (np.broadcast_to(np.asarray(camera, dtype=np.int32), (count,)), group.images[some], group.points[some])
     parts = tuple(
         Part(unknowns[kind], own, at, np.zeros((0, 2, len(at))), -1) for kind, own, at in zip(width, nodes, positions, strict=True)
     )
     factor = np.broadcast_to(_diagonal(np.asarray(group.sigmas[some])), (count, 2, 2))
-    return Chunk(first[some], misclosure, parts, factor, None, rays)
+    return Chunk(first[some], parts, factor, None, rays)
 
 
 @dataclass(frozen=True)
@@ -200,9 +214,12 @@ class Rays:
     count: int
     positions: tuple[Ints, ...]
 
-    def misclosures(self, out: Floats, rows: slice) -> bool:
-        """Fill rows of (count, 2) misclosures; return whether all distortions could be inverted."""
-        return self.evaluation(slice(self.begin + rows.start, self.begin + rows.stop), self.positions, out[rows])
+    def misclosures(self, first: Ints, out: Floats, rows: slice) -> bool:
+        """Store the misclosures of rows at their places `first` in out (n,); return whether all distortions could be inverted."""
+        values = np.empty((rows.stop - rows.start, 2))
+        done = self.evaluation(slice(self.begin + rows.start, self.begin + rows.stop), self.positions, values)
+        _put(out, first[rows], values)
+        return done
 
     def __call__(self, rows: Any, values: Floats) -> None:
         """Write the partials of rows, a slice or indices, part after part."""
@@ -215,7 +232,13 @@ class Rays:
             raise UsageError(f"{self.evaluation.group.name}: a distortion cannot be inverted")
 
 
-def _planned(group: Any, pieces: list[Any], first: Ints, network: Network, state: State, unknowns: Unknowns, kept: Any) -> _Filling:
+def _put(out: Floats, first: Ints | Small, values: Floats) -> None:
+    """Store the (N, m) values of row blocks in their scalar rows."""
+    for r, own in enumerate(values.T):
+        out[first + r] = own
+
+
+def _planned(group: Any, pieces: list[Any], first: Any, network: Network, state: State, unknowns: Unknowns, kept: Any) -> _Filling:
     """Linearise the first of some pieces, and plan a chunk of them all."""
     evaluate, fill = (partial(f, network, state) for f in (group.linearize_piece, group.fill))
     try:
@@ -242,64 +265,66 @@ class _Later:
 
 @dataclass
 class _Filling:
-    """A chunk that is filled piece by piece."""
+    """A chunk of row blocks of m rows that is filled piece by piece."""
 
     name: str
-    first: Ints
+    first: Any
+    m: int
     rows: list[Rows]
     later: list[_Later]
     groups: list[tuple[UnknownGroup, Ints]]
-    misclosure: Floats
     parts: list[Part]
     factors: dict[int, Floats]
     controlled: dict[int, Floats]
 
     @staticmethod
-    def of(rows: Rows, later: list[Any], first: Ints, unknowns: Unknowns, kept: Any, name: str) -> _Filling:
+    def of(rows: Rows, later: list[Any], first: Any, unknowns: Unknowns, kept: Any, name: str) -> _Filling:
         """Plan a chunk from its first piece, and what computes the others."""
         nothing = np.zeros(0, dtype=np.intp)
         groups = [(unknowns[b.kind], kept.get((b.kind, b.jacobian.shape[2]), nothing)) for b in rows.blocks]
-        return _Filling(name, first, [rows], later, groups, np.empty((len(first), rows.misclosure.shape[1])), [], {}, {})
+        return _Filling(name, first, rows.misclosure.shape[1], [rows], later, groups, [], {}, {})
 
     @property
     def size(self) -> int:
         """How many partials there are."""
-        return int(self.misclosure.size * sum(len(at) for _, at in self.groups))
+        return int(len(self.first) * self.m * sum(len(at) for _, at in self.groups))
 
-    def fill(self, values: Floats, start: int, workers: int | None) -> None:
-        """Compute and store everything, the partials in `values` from `start`."""
-        n, m = self.misclosure.shape
+    def fill(self, values: Floats, start: int, misclosure: Floats, workers: int | None) -> None:
+        """Compute and store everything: the partials in `values` from `start`, the misclosures (n,) in their rows."""
+        n, m = len(self.first), self.m
         for group, at in self.groups:
             size = n * m * len(at)
-            self.parts.append(Part(group, np.empty(n, dtype=np.intp), at, values[start : start + size].reshape(n, m, len(at)), start))
+            self.parts.append(Part(group, np.empty(n, dtype=np.int32), at, values[start : start + size].reshape(n, m, len(at)), start))
             start += size
         rows = self.rows.pop()
-        self._put(0, rows)
+        self._put(0, rows, misclosure)
         starts = np.cumsum([len(rows.index), *(piece.count for piece in self.later)])
-        for_each(range(len(self.later)), lambda i: self._add(int(starts[i]), self.later[i]), workers)
+        for_each(range(len(self.later)), lambda i: self._add(int(starts[i]), self.later[i], misclosure), workers)
 
-    def _add(self, start: int, piece: _Later) -> None:
+    def _add(self, start: int, piece: _Later, misclosure: Floats) -> None:
         """Let a piece write its rows where they belong, or store what it computes."""
         try:
-            self._take(start, piece)
+            self._take(start, piece, misclosure)
         except Exception as error:
             error.add_note(f"{self.name}: {piece.name}")
             raise
 
-    def _take(self, start: int, piece: _Later) -> None:
+    def _take(self, start: int, piece: _Later, misclosure: Floats) -> None:
         some = slice(start, start + piece.count)
         parts = [(p.positions, p.nodes[some], p.jacobian[some]) for p in self.parts]
-        sigma = piece.fill(self.misclosure[some], parts)
+        values = np.empty((piece.count, self.m))
+        sigma = piece.fill(values, parts)
         if sigma is None:
-            self._put(start, piece.compute())
+            self._put(start, piece.compute(), misclosure)
         else:
+            _put(misclosure, self.first[some], values)
             self.factors[start] = _diagonal(sigma)
 
-    def _put(self, start: int, rows: Rows) -> None:
+    def _put(self, start: int, rows: Rows, misclosure: Floats) -> None:
         """Whiten and store the row blocks of a piece."""
         some = slice(start, start + len(rows.index))
         factor, whiten = _factor(rows.cofactor, self.name)
-        self.misclosure[some] = _apply(whiten, rows.misclosure[:, :, None])[:, :, 0]
+        _put(misclosure, self.first[some], _apply(whiten, rows.misclosure[:, :, None])[:, :, 0])
         for b, part in zip(rows.blocks, self.parts, strict=True):
             part.nodes[some] = b.nodes
             at = part.positions
@@ -311,7 +336,7 @@ class _Filling:
 
     def chunk(self) -> Chunk:
         """Return the chunk; factors that are all equal are stored once."""
-        n, m = self.misclosure.shape
+        n, m = len(self.first), self.m
         starts = [*sorted(self.factors), n]
         factors = [self.factors[k] for k in starts[:-1]]
         if all(len(f) == 1 and np.array_equal(f, factors[0]) for f in factors):
@@ -319,7 +344,7 @@ class _Filling:
         else:
             factor = np.concatenate([np.broadcast_to(f, (b - a, m, m)) for f, a, b in zip(factors, starts[:-1], starts[1:], strict=True)])
         controlled = np.concatenate([self.controlled[k] for k in starts[:-1]]) if self.controlled else None
-        return Chunk(self.first, self.misclosure, tuple(self.parts), factor, controlled)
+        return Chunk(self.first, tuple(self.parts), factor, controlled)
 
 
 def whitened_misclosures(network: Network, state: State, groups: Sequence[Kind] | Arrangement, workers: int | None = None) -> Floats:
@@ -327,21 +352,19 @@ def whitened_misclosures(network: Network, state: State, groups: Sequence[Kind] 
     arranged = groups if isinstance(groups, Arrangement) else Arrangement.of(groups)
     out = np.empty(int(arranged.offsets[-1]))
     for group, first in zip(arranged.sorted, arranged.first, strict=True):
-        m = len(group.components)
         if hasattr(group, "pieces"):
 
-            def work(piece: Any, group: Any = group, first: Ints = first, m: int = m) -> None:
+            def work(piece: Any, group: Any = group, first: Any = first) -> None:
                 try:
                     white = _white(group.misclosures_of_piece(network, state, piece), group, piece.rows)
                 except Exception as error:
                     error.add_note(f"{group.name}: {group.images_of(network, piece)}")
                     raise
-                for r in range(m):
-                    out[first[piece.rows] + r] = white[:, r]
+                _put(out, first[piece.rows], white)
 
             for_each(group.pieces(network), work, workers)
         else:
-            out[first[:, None] + np.arange(m)] = _white(group.misclosures(network, state), group, slice(None))
+            _put(out, first, _white(group.misclosures(network, state), group, slice(None)))
     return out
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -17,6 +20,7 @@ from baarda.observations import Kind
 
 DOUBLE = 8
 TOLD_FROM = 0.5e9  # bytes
+MANY = 2_000_000  # observations from which it is worth the time to hand memory back
 
 
 def available() -> float:
@@ -50,6 +54,21 @@ def _resident() -> float:
     return float(pages) * float(os.sysconf("SC_PAGE_SIZE"))
 
 
+@cache
+def _trim() -> Callable[[int], int] | None:
+    try:
+        return cast(Callable[[int], int], ctypes.CDLL(None).malloc_trim)
+    except (AttributeError, OSError, TypeError):  # another C library
+        return None
+
+
+def release(count: int) -> None:
+    """Hand back to the system what was freed but the C library keeps, where it can be asked for that, after work on many observations."""
+    trim = _trim()
+    if trim is not None and count >= MANY:
+        trim(0)
+
+
 def of_rows(unknowns: Unknowns, groups: Sequence[Kind], network: Network) -> float:
     """Return the bytes of partials that are stored, misclosures, nodes and results of all observations.
 
@@ -66,7 +85,7 @@ def of_rows(unknowns: Unknowns, groups: Sequence[Kind], network: Network) -> flo
     scalars = [len(g) * len(g.components) for g in groups]
     evaluated = evaluated_groups(groups, network, unknowns)
     stored = sum(n for g, n in enumerate(scalars) if g not in evaluated)
-    return float(DOUBLE * (sum(scalars) * 12 + stored * width) + DOUBLE * unknowns.count * 12)
+    return float(DOUBLE * (sum(scalars) * 10 + stored * width) + DOUBLE * unknowns.count * 12)
 
 
 def of_dense(unknowns: Unknowns) -> float:
@@ -82,7 +101,7 @@ def of_fronts(structure: Structure) -> float:
         return 0.0
     waiting = np.sort((sizes - pivots) ** 2)[::-1]
     depth = int(np.ceil(np.log2(len(sizes) + 1))) + 2
-    return float(DOUBLE * ((sizes * pivots).sum() + (pivots**2).sum() + 3.0 * sizes.max() ** 2 + 2.0 * waiting[:depth].sum()))
+    return float(DOUBLE * ((sizes * pivots).sum() + 3.0 * sizes.max() ** 2 + 2.0 * waiting[:depth].sum()))
 
 
 def check(needed: float, what: str, tell: Callable[[str], None] | None) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baarda.adjustment.point_loops import SMALLEST
-from baarda.adjustment.row_blocks import HEAD, Blocks
+from baarda.adjustment.row_blocks import HEAD, Blocks, put_hat
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -110,7 +110,7 @@ def accumulate(clusters: Ints, front: Floats, y: Floats, rhs: Floats, b: Blocks,
         front[np.ix_(rows, rows)] += np.tril(own[:width, :width] - lines.T @ lines)
 
 
-def statistics(clusters: Ints, z: Floats, b: Blocks, hat: Floats, points: Floats, size: Ints) -> None:
+def statistics(clusters: Ints, z: Floats, b: Blocks, hat: Floats, points: Floats, place: Ints, size: Ints) -> None:
     """As `point_loops._statistics`."""
     for c in clusters:
         some = slice(b.first_point[c], b.first_point[c + 1])
@@ -125,14 +125,13 @@ def statistics(clusters: Ints, z: Floats, b: Blocks, hat: Floats, points: Floats
         core = np.eye(3) + cube[:, :, :width] @ y.reshape(len(y) // 3, 3, width).transpose(0, 2, 1)
         inner = np.linalg.solve(r, np.broadcast_to(np.eye(3), r.shape))
         scale = b.point_inverse[some]
-        points[some] = inner @ core @ inner.transpose(0, 2, 1) * scale[:, :, None] * scale[:, None, :]
+        points[place[some]] = inner @ core @ inner.transpose(0, 2, 1) * scale[:, :, None] * scale[:, None, :]
         for g in groups:
-            m = g.h.shape[1]
             picked = cube[g.points[:, None, None], np.arange(3)[:, None], g.at[:, None, :]]  # (N, 3, w)
             mixed = g.q @ picked @ g.h.transpose(0, 2, 1)
             h = g.q @ core[g.points] @ g.q.transpose(0, 2, 1) - mixed - mixed.transpose(0, 2, 1)
             h += g.h @ local[g.at[:, :, None], g.at[:, None, :]] @ g.h.transpose(0, 2, 1)
-            hat[b.hat[g.kind] + g.rows[:, None] * (m * m) + np.arange(m * m)] = h.reshape(len(h), -1)
+            put_hat(hat, b.hat[g.kind], g.rows, h)
 
 
 def extend(front: Floats, update: Floats, at: Ints) -> None:

@@ -436,8 +436,11 @@ def _between(values: Floats, parts: Ints, count: int, e: int, e2: int, z: Floats
     return total
 
 
-def _statistics(clusters: Ints, z: Floats, b: Any, hat: Floats, points: Floats, size: Ints) -> None:
-    """Store the diagonal blocks of A N^-1 A' and the cofactors (P, 3, 3) of points, from the inverse z of the front of their clusters."""
+def _statistics(clusters: Ints, z: Floats, b: Any, hat: Floats, points: Floats, place: Ints, size: Ints) -> None:
+    """Store the diagonal blocks of A N^-1 A', or only their diagonals, and in their places the cofactors of the points of clusters.
+
+    They come from the inverse z of the front of the clusters.
+    """
     table, first_block, chunk, row, first_point, first_column = b.table, b.first_block, b.chunk, b.row, b.first_point, b.first_column
     values, starts, prior = b.values, b.starts, b.prior
     cluster_rows, is_sparse, inverse, point_inverse, hats = b.cluster_rows, b.sparse, b.inverse, b.point_inverse, b.hat
@@ -545,12 +548,13 @@ def _statistics(clusters: Ints, z: Floats, b: Any, hat: Floats, points: Floats, 
                 for a in range(3):
                     for a2 in range(3):
                         total = half[a, 0] * inner[a2, 0] + half[a, 1] * inner[a2, 1] + half[a, 2] * inner[a2, 2]
-                        points[p, a, a2] = total * point_inverse[p, a] * point_inverse[p, a2]
+                        points[place[p], a, a2] = total * point_inverse[p, a] * point_inverse[p, a2]
                 n = begin_q
                 for i in range(first_block[p], first_block[p + 1]):
                     k = chunk[i]
                     m = table[k, 0]
-                    out = hats[k] + row[i] * m * m
+                    whole = hats[k, 1] == m * m
+                    out = hats[k, 0] + row[i] * hats[k, 1]
                     count = _parts(table, starts, k, row[i], parts)
                     for e in range(m):
                         for a in range(3):  # half of core Q' less T H'
@@ -578,17 +582,21 @@ def _statistics(clusters: Ints, z: Floats, b: Any, hat: Floats, points: Floats, 
                                         values, upper, lower, w, upper2, lower2, w2, local, s * stride + s2, stride
                                     )
                                     uu, uv, vv = uu + fuu, uv + fuv, vv + fvv
+                        if not whole:
+                            hat[out + e], hat[out + d] = 2.0 * uu, 2.0 * vv
+                            continue
                         hat[out + e * m + e] = 2.0 * uu
                         hat[out + d * m + e], hat[out + d * m + d] = uv, 2.0 * vv
                         for e2 in range(e):
                             hat[out + e * m + e2] = _between(values, parts, count, e, e2, local, stride)
                             hat[out + d * m + e2] = _between(values, parts, count, d, e2, local, stride)
                     for e in range(m):
-                        for e2 in range(e + 1):
-                            total = hat[out + e * m + e2]
+                        for e2 in range(0 if whole else e, e + 1):
+                            at, mirror = (e * m + e2, e2 * m + e) if whole else (e, e)
+                            total = hat[out + at]
                             for a in range(3):
                                 total += q_all[n + e, a] * mixed[e2, a] + mixed[e, a] * q_all[n + e2, a]
-                            hat[out + e * m + e2] = hat[out + e2 * m + e] = total
+                            hat[out + at] = hat[out + mirror] = total
                     n += m
                 if sparse:
                     for g in range(touched):

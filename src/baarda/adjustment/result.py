@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,8 +14,9 @@ from threadpoolctl import threadpool_limits
 from baarda.adjustment import estimates, tables
 from baarda.adjustment.covariance import Cofactors
 from baarda.adjustment.datum import Datum
-from baarda.adjustment.linear_system import Linearization
+from baarda.adjustment.linear_system import Chunk, Linearization
 from baarda.adjustment.linearize import offsets_of
+from baarda.adjustment.memory import release
 from baarda.adjustment.solver import Solver
 from baarda.errors import UsageError
 from baarda.geometry import rotation as rot
@@ -139,45 +140,61 @@ class Adjustment:
         for c in self.lin.chunks:
             correlated = c.correlated
             for some in c.pieces():
-                factor, misclosure = c.factor[some], c.misclosure[some]
+                rows, factor = c.rows_of(some), c.factor[some]
+                misclosure = self.lin.misclosure[rows]
                 if correlated:
-                    out[c.rows_of(some)] = -(factor @ misclosure[:, :, None])[:, :, 0]
+                    out[rows] = -(factor @ misclosure[:, :, None])[:, :, 0]
                 else:
-                    out[c.rows_of(some)] = -np.einsum("nii->ni", factor) * misclosure
+                    out[rows] = -np.einsum("nii->ni", factor) * misclosure
         return out
 
     @cached_property
     def sigmas(self) -> Floats:
-        """A-priori standard deviations of all n observations."""
-        return np.concatenate([g.sigma().ravel() for g in self.groups])
+        """A-priori standard deviations of all n observations; one number in memory where all are equal."""
+        given = [g.sigma() for g in self.groups]
+        if all(not any(s.strides) and s.flat[0] == given[0].flat[0] for s in given):
+            return np.broadcast_to(given[0].flat[0], (self.count,))
+        return np.concatenate([s.ravel() for s in given])
 
     @cached_property
-    def _statistics(self) -> dict[str, Floats]:
-        """Diagonals of Qvv and Qvv P, from the blocks I - H of whitened residuals."""
-        return self._diagonals(("qvv", "redundancy"))
-
-    @cached_property
-    def _weighted(self) -> dict[str, Floats]:
-        """Diagonals of P Qvv P and P, and P v."""
-        return self._diagonals(("pqvvp", "pv", "weight"))
-
-    def _diagonals(self, names: tuple[str, ...]) -> dict[str, Floats]:
-        out = {name: np.empty(self.count) for name in names}
+    def _shares(self) -> tuple[Floats, dict[int, Floats]]:
+        """The redundancy numbers, and by their number the hats of the chunks that are not plain."""
         with threadpool_limits(limits=1, user_api="blas"):
-            hats = self.solver.hat()
-        for c, hat in zip(self.lin.chunks, hats, strict=True):
-            diagonal = _plain if not c.correlated and c.controlled is None else _full
+            hats = self.solver.hat(whole=False)
+        whole = {k: hat for k, (c, hat) in enumerate(zip(self.lin.chunks, hats, strict=True)) if not c.plain}
+        out = np.empty(self.count)
+        for k, c in enumerate(self.lin.chunks):
             for some in c.pieces():
-                controlled = None if c.controlled is None else c.controlled[some]
-                rows, found = c.rows_of(some), diagonal(names, c.factor[some], hat[some], c.misclosure[some], controlled)
-                for name, values in found.items():
-                    out[name][rows] = values
+                if k in whole:
+                    left, inverse = c.factor[some] @ _rest(c, whole[k], some), np.linalg.inv(c.factor[some])
+                    out[c.rows_of(some)] = np.einsum("nij,nji->ni", left, inverse)
+                else:
+                    out[c.rows_of(some)] = 1.0 - hats[k][some]
+        del hats
+        release(self.count)
+        return out, whole
+
+    def _diagonal(self, plain: Callable[[Floats, Floats], Floats], full: Callable[[Floats, Floats], Floats]) -> Floats:
+        """Put together one number of each observation.
+
+        `plain` makes it of standard deviations (N, m) and redundancy numbers, `full` of the factors (N, m, m) and the blocks I - H of
+        whitened residuals of correlated observations, or of those that their conditions control in part only.
+        """
+        redundancy, whole = self._shares
+        out = np.empty(self.count)
+        for k, c in enumerate(self.lin.chunks):
+            for some in c.pieces():
+                rows, factor = c.rows_of(some), c.factor[some]
+                if k in whole:
+                    out[rows] = full(factor, _rest(c, whole[k], some))
+                else:
+                    out[rows] = plain(np.einsum("nii->ni", factor), redundancy[rows])
         return out
 
     @property
     def redundancy_numbers(self) -> Floats:
         """r_i = (Qvv P)_ii of all n observations; they sum to r."""
-        return self._statistics["redundancy"]
+        return self._shares[0]
 
     @property
     def controlled_share(self) -> Floats:
@@ -185,22 +202,34 @@ class Adjustment:
 
         The redundancy number of uncorrelated observations, and what stands for it in w, mdb and external reliability of correlated ones.
         """
-        return np.asarray(self._weighted["pqvvp"] / self._weighted["weight"])
+        return self.pqvvp / self._diagonal(lambda sigma, _: 1.0 / sigma**2, lambda f, _: _squares(np.linalg.inv(f)))
 
-    @property
+    @cached_property
     def qvv(self) -> Floats:
         """Diagonal of the cofactor matrix of the residuals."""
-        return self._statistics["qvv"]
+        if all(c.plain and not c.factor.strides[0] and (np.diagonal(c.factor[0]) == 1.0).all() for c in self.lin.chunks if len(c.first)):
+            return self.redundancy_numbers  # all standard deviations are 1
+        return self._diagonal(lambda sigma, r: r * sigma**2, lambda f, rest: np.einsum("nij,nij->ni", f @ rest, f))
 
-    @property
+    @cached_property
     def pv(self) -> Floats:
         """P v."""
-        return self._weighted["pv"]
+        out = np.empty(self.count)
+        for c in self.lin.chunks:
+            correlated = c.correlated
+            for some in c.pieces():
+                rows, factor = c.rows_of(some), c.factor[some]
+                white = self.lin.misclosure[rows]
+                if correlated:
+                    out[rows] = -(np.linalg.inv(factor).transpose(0, 2, 1) @ white[:, :, None])[:, :, 0]
+                else:
+                    out[rows] = -white / np.einsum("nii->ni", factor)
+        return out
 
-    @property
+    @cached_property
     def pqvvp(self) -> Floats:
         """Diagonal of P Qvv P."""
-        return self._weighted["pqvvp"]
+        return self._diagonal(lambda sigma, r: r * (1.0 / sigma**2), lambda f, rest: _quadratic(np.linalg.inv(f), rest))
 
     def residuals_of(self, errors: Floats) -> Floats:
         """Map standardised errors (n, k), whitened and independent, to standardised residuals -Qvv P e, each divided by its sigma."""
@@ -438,26 +467,16 @@ class Adjustment:
         return replace(self, assumptions=(*self.assumptions, *more))
 
 
-def _plain(names: tuple[str, ...], factor: Floats, hat: Floats, misclosure: Floats, controlled: Floats | None) -> dict[str, Floats]:
-    """Return the diagonals (n, m) of `Adjustment._diagonals` of uncorrelated row blocks that their conditions control in full."""
-    sigma = np.einsum("nii->ni", factor)
-    if "weight" in names:
-        weight = 1.0 / sigma**2
-        return {"pqvvp": (1.0 - np.einsum("nii->ni", hat)) * weight, "pv": -misclosure / sigma, "weight": weight}
-    share = 1.0 - np.einsum("nii->ni", hat)
-    return {"qvv": share * sigma**2, "redundancy": share}
+def _rest(c: Chunk, hat: Floats, some: slice) -> Floats:
+    """Return the blocks (n, m, m) of what the hats leave to whitened residuals."""
+    return np.asarray((np.eye(c.m) if c.controlled is None else c.controlled[some]) - hat[some])
 
 
-def _full(names: tuple[str, ...], factor: Floats, hat: Floats, misclosure: Floats, controlled: Floats | None) -> dict[str, Floats]:
-    """As `_plain` for correlated row blocks, and for conditions that control only a part of their observations."""
-    rest = (np.eye(hat.shape[1]) if controlled is None else controlled) - hat
-    inverse = np.linalg.inv(factor)
-    if "weight" in names:
-        weighted = inverse.transpose(0, 2, 1)
-        return {
-            "pqvvp": np.einsum("nij,nji->ni", weighted @ rest, inverse),
-            "pv": -(weighted @ misclosure[:, :, None])[:, :, 0],
-            "weight": np.einsum("nij,nji->ni", weighted, inverse),
-        }
-    left = factor @ rest
-    return {"qvv": np.einsum("nij,nij->ni", left, factor), "redundancy": np.einsum("nij,nji->ni", left, inverse)}
+def _quadratic(inverse: Any, rest: Floats) -> Floats:
+    """Return the diagonals (n, m) of L^-T R L^-1."""
+    return np.asarray(np.einsum("nij,nji->ni", inverse.transpose(0, 2, 1) @ rest, inverse))
+
+
+def _squares(inverse: Any) -> Floats:
+    """Return the diagonals (n, m) of L^-T L^-1."""
+    return np.asarray(np.einsum("nji,nji->ni", inverse, inverse))

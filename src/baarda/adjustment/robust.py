@@ -362,8 +362,8 @@ def excess_kurtosis_of_errors(lin: Linearization, solver: Solver, redundancy: in
     """
     n = lin.count
     shares = np.empty(n)
-    for chunk, hat in zip(lin.chunks, solver.hat(), strict=True):
-        shares[chunk.rows] = 1.0 - np.einsum("nii->ni", hat)
+    for chunk, hat in zip(lin.chunks, solver.hat(whole=False), strict=True):
+        shares[chunk.rows] = 1.0 - (hat if hat.ndim == 2 else np.einsum("nii->ni", hat))
 
     def residuals_of(e: Floats) -> Floats:
         return np.asarray(e - lin.times(solver.solve(lin.transposed(e))))

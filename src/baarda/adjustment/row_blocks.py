@@ -37,9 +37,9 @@ class Blocks(NamedTuple):
     point_inverse : (P, 3) array
     prior : (P, 3) array
         A further row for each coordinate of a point: damping, or 1 where the coordinate is held.
-    hat : array
-        Where the diagonal blocks of A N^-1 A' of each chunk begin.
-    scalar : int array
+    hat : (chunks, 2) int array
+        Where the diagonal blocks of A N^-1 A' of each chunk begin, and the numbers stored of each: see `hats_of`.
+    scalar : int32 or int array
         First scalar row of each row block, chunk after chunk.
     """
 
@@ -58,7 +58,7 @@ class Blocks(NamedTuple):
     point_inverse: Floats
     prior: Floats
     hat: Ints
-    scalar: Ints
+    scalar: Ints | Small
 
 
 def blocks_of(lin: Linearization, structure: Structure, inverse: Floats, damping: float) -> Blocks:
@@ -73,17 +73,37 @@ def blocks_of(lin: Linearization, structure: Structure, inverse: Floats, damping
     damping : float
         Added to the diagonal of the scaled normal matrix.
     """
-    hats = [c.misclosure.size * c.misclosure.shape[1] for c in lin.chunks]
     point_inverse = inverse[structure.point_columns]
     prior = np.where(point_inverse > 0.0, np.sqrt(damping), 1.0)
     columns = structure.order[structure.cluster_columns]
-    scalar = lin.chunks[0].first if len(lin.chunks) == 1 else np.concatenate([np.zeros(0, dtype=np.intp), *(c.first for c in lin.chunks)])
+    scalar = lin.chunks[0].first if len(lin.chunks) == 1 else np.concatenate([np.zeros(0, dtype=np.int32), *(c.first for c in lin.chunks)])
     return Blocks(
         lin.values, table_of(lin, structure),
         structure.starts, structure.first_block, structure.block_chunk, structure.block_row, structure.first_point,
         structure.first_column, structure.cluster_rows, structure.cluster_columns, structure.sparse, inverse[columns], point_inverse, prior,
-        np.cumsum([0, *hats], dtype=np.intp), np.ascontiguousarray(scalar),
+        np.zeros((0, 2), dtype=np.intp), np.ascontiguousarray(scalar),
     )  # fmt: skip
+
+
+def hats_of(lin: Linearization, whole: bool) -> tuple[Ints, int]:
+    """Return where the diagonal blocks of A N^-1 A' of each chunk begin, the numbers stored of each, (chunks, 2), and the size of all.
+
+    Parameters
+    ----------
+    lin : Linearization
+    whole : bool
+        Store the m x m numbers of all blocks; else only the m of their diagonals where the chunk is plain.
+    """
+    each = np.array([c.m if c.plain and not whole else c.m**2 for c in lin.chunks], dtype=np.intp)
+    ends = np.cumsum([0, *(n * len(c.first) for n, c in zip(each, lin.chunks, strict=True))], dtype=np.intp)
+    return np.stack([ends[:-1], each], axis=1), int(ends[-1])
+
+
+def put_hat(hat: Floats, place: Ints, rows: Ints, values: Floats) -> None:
+    """Store the diagonal blocks (N, m, m) of A N^-1 A' of some row blocks of a chunk, or only their diagonals, as `place` of it says."""
+    begin, each = place
+    own = values.reshape(len(values), -1) if each == values[:1].size else np.einsum("nii->ni", values)
+    hat[begin + rows[:, None] * each + np.arange(each)] = own
 
 
 def table_of(lin: Linearization, structure: Structure) -> Ints:
@@ -92,7 +112,7 @@ def table_of(lin: Linearization, structure: Structure) -> Ints:
     table = np.zeros((len(lin.chunks), HEAD + 3 * parts), dtype=np.intp)
     place, rows = 0, 0
     for k, (c, own) in enumerate(zip(lin.chunks, structure.point_part, strict=True)):
-        table[k, :HEAD] = c.misclosure.shape[1], len(c.parts), c.parts[own].start if own >= 0 else -1, place, rows
+        table[k, :HEAD] = c.m, len(c.parts), c.parts[own].start if own >= 0 else -1, place, rows
         for j, p in enumerate(c.parts):
             table[k, HEAD + 3 * j : HEAD + 3 + 3 * j] = p.start, len(p.positions), j != own
         place += len(c.first) * len(c.parts)
@@ -118,7 +138,7 @@ def with_partials(blocks: Blocks, lin: Linearization, spans: Ints) -> Blocks:
     for k, (c, n) in enumerate(zip(lin.chunks, counts, strict=True)):
         if not n:
             continue
-        begin, m = int(spans[k, 0]), c.misclosure.shape[1]
+        begin, m = int(spans[k, 0]), c.m
         some, own = slice(begin, begin + int(n)), values[at : at + int(n) * c.per_block]
         if c.evaluate is not None:
             c.evaluate(some, own)

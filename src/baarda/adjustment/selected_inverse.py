@@ -5,16 +5,17 @@ share a point, and with it the cofactors of the points and the diagonal blocks o
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from baarda.adjustment import lapack
 from baarda.adjustment.linear_system import Linearization
-from baarda.adjustment.row_blocks import scaled_rows, with_partials
-from baarda.adjustment.structure import Front, Structure
+from baarda.adjustment.row_blocks import hats_of, put_hat, scaled_rows, with_partials
+from baarda.adjustment.structure import Front, Run, Structure
 from baarda.adjustment.workers import run_tree
+from baarda.errors import UsageError
 
 if TYPE_CHECKING:
     from baarda.adjustment.block import BlockSolver
@@ -23,17 +24,41 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
 
-def selected_inverse(solver: BlockSolver) -> tuple[list[Floats], Floats, NodeBlocks]:
-    """Return the diagonal blocks of A N^-1 A' of each chunk, the (P, 3, 3) cofactors of the inner points, and those of the nodes.
+class Statistics(NamedTuple):
+    """What the selected inverse gives.
+
+    Attributes
+    ----------
+    hats : list of (N, m, m) or (N, m) arrays, or None
+        The diagonal blocks of A N^-1 A' of each chunk, or their diagonals; None where they were handed over.
+    whole : bool
+        Whether all of them are blocks.
+    points : (points, 3, 3) array
+        Cofactors of all points; zero where a coordinate is fixed or held.
+    nodes : NodeBlocks
+    """
+
+    hats: list[Floats] | None
+    whole: bool
+    points: Floats
+    nodes: NodeBlocks
+
+
+def selected_inverse(solver: BlockSolver, whole: bool) -> Statistics:
+    """Compute the statistics of a solver.
 
     Parameters
     ----------
     solver : BlockSolver
+    whole : bool
+        Store all of the diagonal blocks of A N^-1 A'; else only their diagonals for chunks of uncorrelated rows.
     """
-    structure, lin, blocks = solver.structure, solver.lin, solver.blocks_
-    hat = np.zeros(int(blocks.hat[-1]))
-    points = np.zeros((len(structure.points), 3, 3))
-    own: list[Floats | None] = [None] * len(structure.fronts)
+    structure, lin = solver.structure, solver.lin
+    places, size = hats_of(lin, whole)
+    hat, blocks = np.zeros(size), solver.blocks_._replace(hat=places)
+    nodes = NodeBlocks(structure, solver.inverse)
+    columns = lin.unknowns["point"].columns.reshape(-1, 3)
+    points = np.zeros((len(columns), 3, 3))
     inverses: dict[int, Floats] = {}
     left, lock = [len(f.children) for f in structure.fronts], threading.Lock()
     rest: dict[int, list[tuple[int, Ints, Ints]]] = {}
@@ -63,14 +88,18 @@ def selected_inverse(solver: BlockSolver) -> tuple[list[Floats], Floats, NodeBlo
             z[:p, :p] = 0.5 * (z[:p, :p] + z[:p, :p].T)
         finish(f, z, p)
 
+    def use(run: Run, z: Floats) -> None:
+        arrays = with_partials(blocks, lin, run.spans)
+        solver.loops.statistics(run.clusters, z, arrays, hat, points, structure.points, solver.size)
+
     def finish(f: int, z: Floats, p: int) -> None:
         """Use the inverse of a front, its first p columns its own."""
         front = structure.fronts[f]
         for run in structure.runs_of_fronts[f]:
-            solver.loops.statistics(run.clusters, z, with_partials(blocks, lin, run.spans), hat, points, solver.size)
+            use(run, z)
         for chunk, rows, at in rest.get(f, ()):
-            _rest_hat(lin, solver.inverse, blocks.hat, z, chunk, rows, at, hat)
-        own[f] = z[:p, :p].copy()
+            _rest_hat(lin, solver.inverse, places, z, chunk, rows, at, hat)
+        nodes.keep(f, z, p)
         if front.children:
             inverses[f] = z
         if front.parent >= 0:
@@ -83,50 +112,67 @@ def selected_inverse(solver: BlockSolver) -> tuple[list[Floats], Floats, NodeBlo
     before = [int(f.parent >= 0) for f in reversed(fronts)]  # from the root to the leaves
     run_tree(before, _children_backwards(fronts), lambda i: invert(len(fronts) - 1 - i), lin.workers)
     for run in structure.runs_of_fronts[-1]:
-        solver.loops.statistics(run.clusters, np.zeros((0, 0)), with_partials(blocks, lin, run.spans), hat, points, solver.size)
+        use(run, np.zeros((0, 0)))
     for f, entries in rest.items():
         if f < 0:
             for chunk, rows, at in entries:
-                _rest_hat(lin, solver.inverse, blocks.hat, np.zeros((0, 0)), chunk, rows, at, hat)
-    out = []
-    for k, c in enumerate(lin.chunks):
-        m = c.misclosure.shape[1]
-        out.append(hat[blocks.hat[k] : blocks.hat[k + 1]].reshape(-1, m, m))
-    return out, points, NodeBlocks(structure, [z for z in own if z is not None], solver.inverse)
+                _rest_hat(lin, solver.inverse, places, np.zeros((0, 0)), chunk, rows, at, hat)
+    hats = []
+    for (begin, each), c in zip(places, lin.chunks, strict=True):
+        shape = (-1, c.m, c.m) if whole or not c.plain else (-1, c.m)
+        hats.append(hat[begin : begin + each * len(c.first)].reshape(shape))
+    others = np.ones(len(points), dtype=bool)
+    others[structure.points] = False
+    points[others] = nodes(columns[others])
+    points.flags.writeable = False
+    return Statistics(hats, whole, points, nodes)
 
 
-def _rest_hat(lin: Linearization, inverse: Floats, begins: Ints, z: Floats, chunk: int, rows: Ints, at: Ints, hat: Floats) -> None:
+def _rest_hat(lin: Linearization, inverse: Floats, places: Ints, z: Floats, chunk: int, rows: Ints, at: Ints, hat: Floats) -> None:
     """Store the diagonal blocks of rows without inner point."""
     c = lin.chunks[chunk]
     h = scaled_rows(c, rows, inverse)
     padded = np.zeros((len(z) + 1, len(z) + 1))
     padded[:-1, :-1] = z
-    m = c.misclosure.shape[1]
     values = h @ padded[at[:, :, None], at[:, None, :]] @ h.transpose(0, 2, 1)
-    hat[begins[chunk] + rows[:, None] * (m * m) + np.arange(m * m)] = values.reshape(len(rows), -1)
+    put_hat(hat, places[chunk], rows, values)
 
 
 class NodeBlocks:
-    """Blocks of the inverse whose columns are eliminated in one front."""
+    """Blocks of the inverse, each of one node of the reduced system."""
 
-    def __init__(self, structure: Structure, own: list[Floats], inverse: Floats) -> None:
-        self.own, self.fronts, self.inverse = own, structure.fronts, inverse
-        self.place = np.full(len(inverse), -1)
+    def __init__(self, structure: Structure, inverse: Floats) -> None:
+        self.fronts, self.inverse = structure.fronts, inverse
+        self.place = np.full(len(inverse), -1, dtype=np.int32)
         self.place[structure.order] = np.arange(len(structure.order))
         self.place[-1] = -1
-        begins = np.array([f.begin for f in structure.fronts], dtype=np.intp)
-        self.begins = begins
+        self.begins = np.array([f.begin for f in structure.fronts], dtype=np.intp)
+        self.first = np.repeat(structure.node_first[:-1], np.diff(structure.node_first))  # of each column that of its node
+        self.own: dict[int, Floats] = {}
+
+    def keep(self, f: int, z: Floats, p: int) -> None:
+        """Keep what is needed of the inverse of a front, its first p columns its own: of each row the columns of its node."""
+        begin = self.fronts[f].begin
+        own = self.first[begin : begin + p] - begin
+        width = int((np.arange(len(own)) - own).max(initial=-1)) + 1
+        columns = np.minimum(own[:, None] + np.arange(width), len(own) - 1)
+        self.own[f] = z[np.arange(len(own))[:, None], columns]
 
     def __call__(self, columns: Ints) -> Floats:
         """Return (N, w, w) blocks; zero where a column is -1 or held."""
         at = self.place[columns]
+        last = at.max(axis=1, initial=-1)
         out = np.zeros((*columns.shape, columns.shape[1]))
-        front = np.searchsorted(self.begins, at.max(axis=1), side="right") - 1
-        for f in np.unique(front[at.max(axis=1) >= 0]):
-            rows = np.flatnonzero((front == f) & (at.max(axis=1) >= 0))
-            local = np.where(at[rows] >= 0, at[rows] - self.fronts[f].begin, 0)
-            weight = np.where(at[rows] >= 0, self.inverse[columns[rows]], 0.0)
-            out[rows] = self.own[f][local[:, :, None], local[:, None, :]] * weight[:, :, None] * weight[:, None, :]
+        front = np.searchsorted(self.begins, last, side="right") - 1
+        for f in np.unique(front[last >= 0]):
+            rows = np.flatnonzero((front == f) & (last >= 0))
+            first, there = self.first[last[rows]][:, None], at[rows] >= 0
+            if (self.first[at[rows]] != first)[there].any():
+                raise UsageError("a block of the inverse must be that of one node")
+            local = np.where(there, at[rows] - first, 0)
+            weight = np.where(there, self.inverse[columns[rows]], 0.0)
+            line = (first - self.fronts[f].begin)[:, :, None] + local[:, :, None]
+            out[rows] = self.own[f][line, local[:, None, :]] * weight[:, :, None] * weight[:, None, :]
         return out
 
 

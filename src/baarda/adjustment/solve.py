@@ -154,7 +154,7 @@ def adjust(network: Network, **options: Any) -> Adjustment:
 
 def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDArray[np.bool_], notes: list[str]) -> Adjustment:
     prepared, more = complete(prepared, aside)
-    shift = -prepared.centroid()
+    source, shift = prepared, -prepared.centroid()
     prepared = prepared.shifted(shift)
     groups = active_groups(prepared, ~aside)
     unknowns = unknowns_of(prepared, ~aside, np.isin(np.arange(len(prepared.cameras)), prepared.images.cameras))
@@ -185,6 +185,7 @@ def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDAr
         )
     structure = analyse(lin, rank, start.points) if kind == "block" else None
     if structure is not None:
+        memory.release(lin.count)
         memory.check(memory.of_fronts(structure), "the factor and its inverse", settings.tell)
 
     def factor(lin: Linearization, datum: Datum, damping: float = 0.0) -> Solver:
@@ -192,22 +193,23 @@ def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDAr
             return DenseSolver.of(lin, datum.held, damping)
         return BlockSolver.of(lin, structure, datum.held, damping)
 
-    far = viewpoints_of(groups, start).far(start.points)
+    viewpoints = viewpoints_of(groups, start)
+    far = viewpoints.far(start.points)
     datum = choose_datum(defect, lin, settings, prepared, far)
     given = [lin]
     del lin  # so that the iteration can let it go
-    state, lin, history, converged = iterate(prepared, start, given.pop(), arranged, datum, factor, settings)
+    state, lin, history, converged = iterate(prepared, start, given.pop(), arranged, datum, factor, settings, viewpoints)
     law = None
     if settings.robust is not None:
         found = adjust_under_law(prepared, state, lin, arranged, datum, factor, settings, redundancy, history)
         state, lin, history, converged, law = found
         more = [*more, *law.assumptions]
     datum = choose_datum(find_defect(lin, state) if defect.count else defect, lin, settings, prepared, far)
+    memory.release(lin.count)
     solver = factor(lin, datum)
-    adjusted = state.write_to(prepared).shifted(-shift)
     return Adjustment(
-        network=adjusted,
-        start=start.write_to(prepared).shifted(-shift),
+        network=state.shifted(-shift).write_to(source),
+        start=source,
         numbering=unknowns,
         groups=tuple(groups),
         lin=lin,

@@ -27,8 +27,8 @@ class Solver(Protocol):
     def least_squares(self, y: Floats) -> tuple[Floats, Floats]:
         """Return x = N^-1 A'y for an (n,) vector in the place of the whitened observations, and A x."""
 
-    def hat(self) -> list[Floats]:
-        """Return for each chunk the (N, m, m) diagonal blocks of A N^-1 A'."""
+    def hat(self, whole: bool = True) -> list[Floats]:
+        """Return for each chunk the (N, m, m) diagonal blocks of A N^-1 A'; without `whole` only their diagonals (N, m) if it is plain."""
 
     def blocks(self, columns: Ints) -> Floats:
         """Return the (N, w, w) blocks of N^-1 for (N, w) columns; -1 = fixed, zero."""

@@ -84,6 +84,8 @@ class Structure:
     ----------
     order : (U,) int array
         Unknowns of the reduced system in the order of elimination; -1 = a parameter that is fixed.
+    node_first : (nodes + 1,) int array
+        Where the columns of each node begin in that order.
     points : (P,) int array
         Inner points in the order of clusters.
     point_columns : (P, 3) int array
@@ -111,6 +113,7 @@ class Structure:
     """
 
     order: Ints
+    node_first: Ints
     points: Ints
     point_columns: Ints
     first_block: Ints
@@ -231,6 +234,7 @@ def analyse(lin: Linearization, rank: Ints, coordinates: Floats, border: Ints | 
     in_cluster = column[:-1] - column[ends[cluster]]
     return Structure(
         order=nodes.unknowns[_ranges(nodes.offset[elimination], nodes.width[elimination])],
+        node_first=np.concatenate([[0], np.cumsum(nodes.width[elimination])]).astype(np.intp),
         points=points,
         point_columns=lin.unknowns["point"].columns.reshape(-1, 3)[points],
         first_block=blocks.first,

@@ -128,7 +128,10 @@ def standardised(
     if redundancy_numbers is not None:
         seen &= np.asarray(redundancy_numbers, dtype=float) >= UNCONTROLLED
     if seen.all():
-        return np.asarray(v / (sigma0 * np.sqrt(q)))
+        w = np.asarray(np.sqrt(q))
+        w *= sigma0
+        np.divide(v, w, out=w)
+        return w
     w = np.full(v.shape, np.nan)
     np.divide(v, sigma0 * np.sqrt(np.where(seen, q, 1.0)), out=w, where=seen)
     return w
@@ -321,7 +324,9 @@ def mdb(
     seen = r >= UNCONTROLLED
     bias = np.full(r.shape, np.nan)
     np.divide(q, r, out=bias, where=seen)
-    return np.asarray(sigma0 * delta0(alpha, power) * np.sqrt(bias))
+    np.sqrt(bias, out=bias)
+    bias *= sigma0 * delta0(alpha, power)
+    return bias
 
 
 def estimated_error(residuals: ArrayLike, redundancy_numbers: ArrayLike) -> Floats:

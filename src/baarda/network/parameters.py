@@ -18,6 +18,8 @@ from baarda.network.viewpoints import Viewpoints
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
+PIECE = 65536  # points that are moved at a time
+
 
 @dataclass(frozen=True)
 class UnknownGroup:
@@ -260,10 +262,11 @@ class State:
         flat = padded[camera.columns]
         image = padded[unknowns["image"].columns].reshape(-1, 6)
         own = unknowns["point"].columns.reshape(-1, 3)
-        points = self.points + padded[own]
+        steps = padded[own]
+        points = self.points + steps
         if viewpoints is not None:
-            whole = (own >= 0).all(axis=1)
-            points[whole] = viewpoints.moved(self.points, padded[own])[whole]
+            whole = np.all(own >= 0, axis=1, keepdims=True)
+            points = np.where(whole, viewpoints.moved(self.points, steps), points)
         return State(
             tuple(c + flat[camera.offsets[i] : camera.offsets[i + 1]] for i, c in enumerate(self.cameras)),
             self.position + image[:, :3],
@@ -271,6 +274,11 @@ class State:
             points,
             tuple(d.moved(padded[unknowns[d.kind].columns]) for d in self.declared),
         )
+
+    def shifted(self, shift: Floats) -> State:
+        """Return the state with `shift` added to all object coordinates."""
+        declared = tuple(d.shifted(shift) for d in self.declared)
+        return State(self.cameras, self.position + shift, self.rotation, self.points + shift, declared)
 
     def write_to(self, network: Network) -> Network:
         """Return the network with these values in its tables."""

@@ -42,11 +42,13 @@ class Viewpoints:
         array([1.])
         """
         rays = np.bincount(points, minlength=count)
+        origin = np.nan_to_num(position[:1]).sum(axis=0)  # squares of small numbers round less
+        near = position - origin
+        table = np.concatenate([near, (near**2).sum(axis=1)[:, None]], axis=1)
         with np.errstate(invalid="ignore"):
-            total = [np.bincount(points, position[images, k], count) for k in range(3)]
-            centres = np.stack(total, axis=1) / rays[:, None]
-            off = ((position[images] - centres[points]) ** 2).sum(axis=1)
-            return Viewpoints(centres, np.sqrt(np.bincount(points, off, count) / rays))
+            x, y, z, square = (np.bincount(points, column[images], count) / rays for column in table.T)
+            centres = np.stack([x, y, z], axis=1)
+            return Viewpoints(centres + origin, np.sqrt(np.maximum(square - (centres**2).sum(axis=1), 0.0)))
 
     def far(self, points: Floats) -> Bools:
         """Return which points (n, 3) are so far that only their directions and inverse distances have nearly normal errors."""
@@ -91,21 +93,21 @@ class Viewpoints:
                [ 12.5 ,   1.25,   0.  ],
                [-10.  ,   0.  ,   0.  ]])
         """
-        ray = points - self.centres
-        with np.errstate(divide="ignore", invalid="ignore"):
-            square = np.einsum("ni,ni->n", ray, ray)
-            s = np.einsum("ni,ni->n", steps, ray) / square
-            before = self.base / np.sqrt(square)  # the inverse distance in inverse bases, and that after the step
-            after = before * (1.0 - s)
+        out, ray = points + steps, points - self.centres
+        square, along = np.einsum("ni,ni->n", ray, ray), np.einsum("ni,ni->n", steps, ray)
+        reach = (FAR * self.base) ** 2
+        some = np.flatnonzero((np.abs(along) > SMALL * square) | ((square > reach) & (reach > 0.0)))  # false for NaN
+        if not len(some):
+            return out
+        ray, steps, s = ray[some], steps[some], along[some] / square[some]
+        before = self.base[some] / np.sqrt(square[some])  # the inverse distance in inverse bases, and that after the step
+        after = before * (1.0 - s)
         far = (before > 0.0) & (before < 1.0 / FAR) & (after > -1.0 / FAR)
-        out = points + steps
-        at = np.flatnonzero(~far & (np.abs(s) > SMALL))
-        near = s[at]
+        near = np.where(far | (np.abs(s) <= SMALL), 0.0, s)
         longer = np.where(near < 0.5, near / (1.0 - np.minimum(near, 0.5)), 4.0 * near - 1.0)
-        out[at] += (longer - near)[:, None] * ray[at]
-        at = np.flatnonzero(far)
-        least = 1.0 / FARTHEST
-        longer = before[at] / np.where(np.abs(after[at]) < least, np.copysign(least, after[at]), after[at]) - 1.0
-        across = steps[at] - s[at, None] * ray[at]
-        out[at] = points[at] + longer[:, None] * ray[at] + (1.0 + longer)[:, None] * across
+        out[some] += (longer - near)[:, None] * ray
+        at, ray, least = some[far], ray[far], 1.0 / FARTHEST
+        longer = before[far] / np.where(np.abs(after[far]) < least, np.copysign(least, after[far]), after[far]) - 1.0
+        across = steps[far] - s[far, None] * ray
+        out[at] = points[at] + longer[:, None] * ray + (1.0 + longer)[:, None] * across
         return out

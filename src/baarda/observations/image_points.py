@@ -64,7 +64,7 @@ class Evaluation:
         g, some = self.group, _together(rows)
         if weights is None:
             weights = 1.0 / (g.sigmas[:1] if g.sigmas.strides[0] == 0 else g.sigmas[some])
-        own = [_read_only(x[some]) for x in (g.images, g.points, g.xy)]
+        own = [_read_only(x) for x in (g.images[some].astype(np.intp), g.points[some].astype(np.intp), g.xy[some])]
         out = partials if len(partials) else [np.empty((0, 2, len(p))) for p in positions]
         failed = self.loop(
             *self.fixed, *own, weights, 0, len(own[0]), len(partials) > 0, positions[0], positions[1], misclosure, *out

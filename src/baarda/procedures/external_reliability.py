@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,7 +103,7 @@ def external_effects(a: Adjustment, biases: Floats) -> Effects:
     return Effects(values, table[column], np.where(ratios < 0.0, np.nan, ratios), complete)
 
 
-def _batches(nodes: Ints, columns: Ints) -> list[Ints]:
+def _batches(nodes: NDArray[Any], columns: Ints) -> list[Ints]:
     """Return the row blocks of some nodes at a time, about `WIDTH` unknowns together; none where nothing is unknown."""
     free = np.flatnonzero((columns >= 0).any(axis=1))
     if not len(free):

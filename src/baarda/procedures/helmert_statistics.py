@@ -96,9 +96,9 @@ class PartSolver:
         x = self.solve(self.solver.lin.transposed(y))
         return x, self.solver.lin.times(x)
 
-    def hat(self) -> list[Floats]:
-        """Return for each chunk the (N, m, m) diagonal blocks of A N^-1 A'."""
-        return self.given.hat()
+    def hat(self, whole: bool = True) -> list[Floats]:
+        """Return for each chunk the (N, m, m) diagonal blocks of A N^-1 A'; without `whole` only their diagonals (N, m) if it is plain."""
+        return self.given.hat(whole)
 
     def blocks(self, columns: Ints) -> Floats:
         """Return the (N, w, w) blocks of N^-1 for (N, w) columns."""

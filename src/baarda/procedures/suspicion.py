@@ -67,7 +67,7 @@ def weighted_cofactors(a: Adjustment) -> list[tuple[Ints, Floats, Floats]]:
         inverse = np.linalg.inv(c.factor)
         weighted = inverse.transpose(0, 2, 1)
         g = weighted @ (np.eye(hat.shape[1]) - hat) @ inverse
-        out.append((c.rows, -(weighted @ c.misclosure[:, :, None])[:, :, 0], g))
+        out.append((c.rows, -(weighted @ a.lin.misclosure[c.rows][:, :, None])[:, :, 0], g))
     return out
 
 
