@@ -46,6 +46,7 @@ K1, K2, K3, K4, K5, K6, P1, P2 = range(12 * BATCH, 20 * BATCH, BATCH)
 PX, PY, CHAIN = 20 * BATCH, 28 * BATCH, 36 * BATCH
 # and in that of a batch: vector from the camera in its system, -1 / W, normalised and measured coordinates, weights; then of the inversion
 U, V, W, INVERSE, XN, YN, MX, MY, WX, WY, BEST_X, BEST_Y, LEAST, STATE, PIXEL_X, PIXEL_Y = range(0, 16 * BATCH, BATCH)
+H0, H1, H2, H3, H4, H5 = BEST_X, BEST_Y, LEAST, STATE, PIXEL_X, PIXEL_Y  # after it, of both coordinates to the vector from the camera
 ROWS = 16 * BATCH
 OPEN, DONE, FAILED = 0.0, 1.0, 2.0  # states of a row in the inversion
 
@@ -257,15 +258,15 @@ def _evaluate(
     p = np.zeros((k + 1, BATCH))
     s, m, g, own = np.empty(CHAIN), np.empty(CHAIN), np.empty(ROWS), np.empty(6)  # ideal chain, measured chain, batch, one row
     dp, dm = np.zeros((kept, 2, BATCH)), np.zeros((kept, 2, BATCH))  # of the ideal chain and of the measured one
-    every = 1 if len(weights) > 1 else 0
+    every = np.uint64(1 if len(weights) > 1 else 0)
     held = -1  # the camera of all rows of p
     whole = len(keep_image) == 6 and (keep_image == np.arange(6)).all()
     for first in range(begin, end, BATCH):
         n, to = min(BATCH, end - first), first - begin
         one, same = camera_of_image[image[first]], True
         for i in range(n):
-            row = first + i
-            im, pt = image[row], point[row]
+            row = np.uint64(first + i)
+            im, pt = np.uint64(image[row]), np.uint64(point[row])  # unsigned places spare the test for negative ones
             same = same and camera_of_image[im] == one
             x, y, z = points[pt, 0] - position[im, 0], points[pt, 1] - position[im, 1], points[pt, 2] - position[im, 2]
             g[U + i] = rotation[im, 0, 0] * x + rotation[im, 0, 1] * y + rotation[im, 0, 2] * z
@@ -322,23 +323,33 @@ def _evaluate(
                 t0, t1 = dp[j, 0, i] - dm[j, 0, i], dp[j, 1, i] - dm[j, 1, i]
                 d_camera[to + i, 0, j] = s[A + i] * t0 + s[B + i] * t1
                 d_camera[to + i, 1, j] = s[C + i] * t0 + s[E + i] * t1
+        for i in range(n):  # vectorised: what the partials of each row are made of
+            a, b, c, e, inverse = s[A + i], s[B + i], s[C + i], s[E + i], g[INVERSE + i]
+            d00, d01, d10, d11 = s[D00 + i], s[D01 + i], s[D10 + i], s[D11 + i]
+            f0, f1 = (a * d00 + b * d10) * inverse, (a * d01 + b * d11) * inverse
+            g0, g1 = (c * d00 + e * d10) * inverse, (c * d01 + e * d11) * inverse
+            g[H0 + i], g[H1 + i], g[H2 + i] = f0, f1, f0 * g[XN + i] + f1 * g[YN + i]
+            g[H3 + i], g[H4 + i], g[H5 + i] = g0, g1, g0 * g[XN + i] + g1 * g[YN + i]
         for i in range(n):
-            im = image[first + i]
-            u, v, w, inverse = g[U + i], g[V + i], g[W + i], g[INVERSE + i]
+            im, to_row = np.uint64(image[first + i]), np.uint64(to + i)
+            u, v, w = g[U + i], g[V + i], g[W + i]
+            m00, m01, m02 = rotation[im, 0, 0], rotation[im, 0, 1], rotation[im, 0, 2]
+            m10, m11, m12 = rotation[im, 1, 0], rotation[im, 1, 1], rotation[im, 1, 2]
+            m20, m21, m22 = rotation[im, 2, 0], rotation[im, 2, 1], rotation[im, 2, 2]
             for r in range(2):
-                a, b = (s[A + i], s[B + i]) if r == 0 else (s[C + i], s[E + i])
-                f0, f1 = a * s[D00 + i] + b * s[D10 + i], a * s[D01 + i] + b * s[D11 + i]
-                h0, h1, h2 = f0 * inverse, f1 * inverse, (f0 * g[XN + i] + f1 * g[YN + i]) * inverse
-                for c in range(3):
-                    own[c] = -(h0 * rotation[im, 0, c] + h1 * rotation[im, 1, c] + h2 * rotation[im, 2, c])
-                    d_point[to + i, r, c] = -own[c]
-                own[3], own[4], own[5] = h2 * v - h1 * w, h0 * w - h2 * u, h1 * u - h0 * v
+                h0, h1, h2 = (g[H0 + i], g[H1 + i], g[H2 + i]) if r == 0 else (g[H3 + i], g[H4 + i], g[H5 + i])
+                x = h0 * m00 + h1 * m10 + h2 * m20
+                y = h0 * m01 + h1 * m11 + h2 * m21
+                z = h0 * m02 + h1 * m12 + h2 * m22
+                omega, phi, kappa = h2 * v - h1 * w, h0 * w - h2 * u, h1 * u - h0 * v
+                d_point[to_row, r, 0], d_point[to_row, r, 1], d_point[to_row, r, 2] = x, y, z
                 if whole:
-                    for place in range(6):
-                        d_image[to + i, r, place] = own[place]
+                    d_image[to_row, r, 0], d_image[to_row, r, 1], d_image[to_row, r, 2] = -x, -y, -z
+                    d_image[to_row, r, 3], d_image[to_row, r, 4], d_image[to_row, r, 5] = omega, phi, kappa
                 else:
+                    own[0], own[1], own[2], own[3], own[4], own[5] = -x, -y, -z, omega, phi, kappa
                     for place in range(len(keep_image)):
-                        d_image[to + i, r, place] = own[keep_image[place]]
+                        d_image[to_row, r, place] = own[keep_image[place]]
     return -1
 
 
