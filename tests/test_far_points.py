@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +20,7 @@ from baarda.cameras import FIXED, FREE
 from baarda.cli import app
 from baarda.formats import project
 from baarda.network import Network, State, Viewpoints, unknowns_of
-from baarda.observations import viewpoints_of
+from baarda.observations import Distances, viewpoints_of
 from baarda.procedures.helmert import solve_blocked
 from baarda.procedures.partition_folder import write_partition
 from baarda.procedures.synthetic import synthetic
@@ -118,6 +119,68 @@ def test_a_free_network_does_not_hang_on_far_points(factor: float) -> None:
     alone = baarda.adjust(rest, solver="dense")
     ratio = np.median(sigma[0] / np.sqrt(np.einsum("nii->n", alone.point_cofactors[others])))
     assert 0.9 < ratio < 1.0  # like stars they fix the rotations, and nothing else
+
+
+@pytest.mark.parametrize("bases", [3.0, 10.0, 60.0])
+def test_a_free_network_finds_out_which_points_are_far(bases: float) -> None:
+    """Points that start near and prove to be far leave the inner constraints, as if that had been known from the start."""
+    network, _, chosen = far_network(1e6, control=0)
+    expected = baarda.adjust(network, solver="block")
+    seen = viewpoints_of(network.observations, State.of(network))
+    start = np.array(network.points.coordinates)
+    ray = start[chosen] - seen.centres[chosen]
+    start[chosen] = seen.centres[chosen] + ray * (bases * seen.base[chosen] / np.linalg.norm(ray, axis=1))[:, None]
+    found = baarda.adjust(replace(network, points=replace(network.points, coordinates=start)), solver="block")
+    assert found.status == "converged" and found.datum.text == expected.datum.text
+    assert found.objective == pytest.approx(expected.objective, rel=1e-9)
+    others = np.setdiff1d(np.arange(len(start)), chosen)
+    sigma = [np.sqrt(np.einsum("nii->n", a.point_cofactors[others])) for a in (found, expected)]
+    np.testing.assert_allclose(sigma[0], sigma[1], rtol=1e-4)
+
+
+@pytest.mark.parametrize("seed", [5, 7])
+def test_many_far_points_are_no_chance_for_the_dense_solver(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some of many come out a million bases away by chance: Cartesian normal equations would lose them."""
+    monkeypatch.setattr(sys.modules[__name__], "COUNT", 100)
+    network, _, _ = far_network(1e5, points=160, seed=seed)
+    dense, block = (baarda.adjust(network, solver=s) for s in ("dense", "block"))
+    assert dense.status == block.status == "converged"
+    assert dense.objective == pytest.approx(block.objective, rel=1e-10)
+    np.testing.assert_allclose(dense.redundancy_numbers.sum(), dense.redundancy, rtol=1e-5)
+
+
+def test_points_that_other_observations_tie_keep_to_coordinates() -> None:
+    """A far point with distances to others starts where it is given, and does not pass infinity."""
+    made = far_network(1e5, wrong=0.0)
+    network, truth, chosen = made
+    near = np.flatnonzero(network.points.roles == 1)[:3]
+    true = truth.points.coordinates
+    network = replace(network, points=replace(network.points, coordinates=true))
+    ends = [(a, b) for a in chosen for b in near]
+    lengths = np.array([np.linalg.norm(true[a] - true[b]) for a, b in ends])
+    a, b = (np.array(x) for x in zip(*ends, strict=True))
+    tied = Distances(a, b, lengths, np.full(len(a), 100.0))
+    found = baarda.adjust(replace(network, observations=(*network.observations, tied)))
+    assert found.status == "converged" and not found.behind
+    assert 0.7 < found.variance_factor < 1.3
+    assert not any("nearer" in text for text in found.assumptions)
+
+
+def test_a_point_amid_its_images_is_not_far() -> None:
+    made = synthetic("ring", 8, points=30, seed=3).network
+    middle = made.images.position.mean(axis=0)
+    shift = middle - np.array(made.points.coordinates)[0]
+    network = replace(made, images=replace(made.images, position=made.images.position - shift))
+    seen = viewpoints_of(network.observations, State.of(network))
+    assert not seen.far(network.points.coordinates).any()
+    np.testing.assert_allclose(Viewpoints(np.zeros((1, 3)), np.ones(1)).moved(np.array([[0.5, 0, 0]]), np.array([[-0.5, 0, 0]])), 0.0)
+
+
+def test_near_points_move_by_the_inverse_distance_and_beyond_half_of_it_in_proportion() -> None:
+    seen = Viewpoints(np.zeros((5, 3)), np.ones(5))
+    steps = np.array([0.05, 0.2, 0.49, 0.51, 2.0])
+    moved = seen.moved(np.full((5, 3), [10.0, 0.0, 0.0]), 10.0 * steps[:, None] * np.array([1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(moved[:, 0], [10.5, 12.5, 10.0 / 0.51, 20.4, 80.0])
 
 
 def test_parts_agree_with_the_whole(tmp_path: Any) -> None:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, sparse
 
 from baarda.adjustment.linear_system import Linearization
 from baarda.errors import Singular
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+
+
+DEPENDENT = 1e-6  # smallest eigenvalue of the scaled normal matrix of a point below which its columns are made orthogonal first
+SMALLEST = 1e-12  # a column that others explain to this share is not determined
 
 
 @dataclass(frozen=True)
@@ -24,7 +28,7 @@ class DenseSolver:
     lin: Linearization
     kept: Ints
     factor: Floats
-    scale: Floats
+    transform: Any  # sparse (k, k): what it makes of the columns was factored
     rcond: float
 
     @staticmethod
@@ -39,8 +43,17 @@ class DenseSolver:
         kept = np.setdiff1d(np.arange(lin.unknowns.count), held)
         scale = lin.scale[kept]
         normal = (lin.design.T @ lin.design).toarray()[np.ix_(kept, kept)] / np.outer(scale, scale)
+        transform: Any = sparse.diags_array(1.0 / scale).tocsr()
+        far = _nearly_dependent(lin, kept, normal)
+        if far:  # normal equations lose the square of what the columns still hold
+            transform = transform.tolil()
+            for at, inverse in far:
+                transform[np.ix_(at, at)] = inverse
+            transform = transform.tocsr()
+            columns = lin.design.tocsc()[:, kept] @ transform
+            normal = (columns.T @ columns).toarray()
         factor, rcond = factorise(normal + damping * np.eye(len(kept)), [kept], lin)
-        return DenseSolver(lin, kept, factor, scale, rcond)
+        return DenseSolver(lin, kept, factor, transform, rcond)
 
     def at(self, lin: Linearization | None) -> DenseSolver:
         """Return this factor for the system at a state nearby, as an approximate one; None only lets the old system go."""
@@ -50,7 +63,7 @@ class DenseSolver:
         """Return N^-1 rhs for (u,) or (u, k) right-hand sides; held unknowns stay zero."""
         columns = rhs.reshape(len(rhs), -1)
         out = np.zeros_like(columns)
-        out[self.kept] = linalg.cho_solve((self.factor, True), columns[self.kept] / self.scale[:, None]) / self.scale[:, None]
+        out[self.kept] = self.transform @ linalg.cho_solve((self.factor, True), self.transform.T @ columns[self.kept])
         return out.reshape(rhs.shape)
 
     def least_squares(self, y: Floats) -> tuple[Floats, Floats]:
@@ -90,9 +103,30 @@ class DenseSolver:
         n = len(self.kept)
         out = np.zeros((n + 1, n + 1))
         half, _ = linalg.lapack.dtrtri(self.factor, lower=1)
-        half = np.tril(half)
-        out[:n, :n] = (half.T @ half) / np.outer(self.scale, self.scale)
+        half = np.tril(half) @ self.transform.T
+        out[:n, :n] = half.T @ half
         return out
+
+
+def _nearly_dependent(lin: Linearization, kept: Ints, normal: Floats) -> list[tuple[Ints, Floats]]:
+    """Return the points whose three columns hardly differ, as those of points far away: their places, and R^-1 of the columns' QR.
+
+    Columns that differ by rounding only are left for the factorisation to refuse.
+    """
+    place = np.full(lin.unknowns.count + 1, -1)
+    place[kept] = np.arange(len(kept))
+    at = place[lin.unknowns["point"].columns.reshape(-1, 3)]
+    at = at[(at >= 0).all(axis=1)]
+    at = at[np.linalg.eigvalsh(normal[at[:, :, None], at[:, None, :]])[:, 0] < DEPENDENT] if len(at) else at
+    out: list[tuple[Ints, Floats]] = []
+    design: Any = lin.design.tocsc() if len(at) else None
+    for own in at:
+        columns = design[:, kept[own]]
+        rows = np.unique(columns.indices)
+        r = np.linalg.qr(np.asarray(columns[rows].toarray(), dtype=float))[1]
+        if r.shape[0] == 3 and np.all(np.abs(np.diag(r)) > SMALLEST * np.sqrt((r**2).sum(axis=0))):
+            out.append((own, np.linalg.inv(r)))
+    return out
 
 
 def factorise(matrix: Floats, columns: list[Ints], lin: Linearization) -> tuple[Floats, float]:

@@ -37,7 +37,7 @@ class FarPoints:
 
 
 def far_points(a: Adjustment, sigma: Scaling) -> FarPoints:
-    """Return the points whose inverse distance from their images is less than 3 of its standard deviations.
+    """Return the points beyond 100 bases of their rays whose inverse distance is less than 3 of its standard deviations.
 
     Image coordinates are nearly linear in the inverse distance rho = 1/r, which may come out negative: the rays open, the point stands
     behind its images. Its standard deviation is sigma_r / r^2, so that the ratio is r / sigma_r.
@@ -55,7 +55,7 @@ def far_points(a: Adjustment, sigma: Scaling) -> FarPoints:
     ray = state.points[own] - seen.centres[own]
     r = np.linalg.norm(ray, axis=1)
     deviation = a.scale(sigma) * np.sqrt(np.einsum("ni,nij,nj->n", ray, a.point_cofactors[own], ray)) / r
-    weak = np.flatnonzero(r < RESOLVED * deviation)
+    weak = np.flatnonzero(seen.far(state.points)[own] & (r < RESOLVED * deviation))
     own, r, deviation = own[weak], r[weak], deviation[weak]
     front = np.zeros(len(network.points.labels))  # rays with the point in front of the camera, less the others
     for group in a.groups if len(own) else ():

@@ -27,7 +27,7 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
 
 ENOUGH = 4  # points for a resection
-PARALLEL = 0.1  # root mean square angle of rays to their mean, radians, up to which they may meet almost at infinity
+PARALLEL = 0.02  # root mean square angle of rays to their mean, radians, up to which they may meet almost at infinity
 
 
 def complete(network: Network, aside: Bools) -> tuple[Network, list[str]]:
@@ -71,7 +71,11 @@ def complete(network: Network, aside: Bools) -> tuple[Network, list[str]]:
     if missing_images.any():
         notes.append(f"start values of {int(missing_images.sum())} image(s) by {' and '.join(search.methods)}")
     if missing_points.any():
-        notes.append(f"start values of {int(missing_points.sum())} point(s) by intersection")
+        if count := int(missing_points.sum()) - int(search.far.sum()):
+            notes.append(f"start values of {count} point(s) by intersection")
+        if search.far.any():
+            names = _names(points.labels, search.far)
+            notes.append(f"start values of {int(search.far.sum())} point(s) far out on rays that do not meet: {names}")
     network = replace(
         network,
         images=replace(images, position=search.position, rotation=search.rotation),
@@ -80,15 +84,18 @@ def complete(network: Network, aside: Bools) -> tuple[Network, list[str]]:
     return _nearer(network, aside, notes)
 
 
+def _names(labels: tuple[str, ...], which: Bools) -> str:
+    at = np.flatnonzero(which)
+    return ", ".join(labels[i] for i in at[:10]) + (", ..." if len(at) > 10 else "")
+
+
 def _nearer(network: Network, aside: Bools, notes: list[str]) -> tuple[Network, list[str]]:
     """Bring the start values of points almost at infinity to where their distance still counts in the normal equations."""
     seen, points = viewpoints_of(network.observations, State.of(network)), network.points
     which = seen.beyond_start(points.coordinates) & (points.states == FREE).all(axis=1) & ~aside
     if not which.any():
         return network, notes
-    labels = [points.labels[i] for i in np.flatnonzero(which)]
-    names = ", ".join(labels[:10]) + (", ..." if len(labels) > 10 else "")
-    note = f"start values of {len(labels)} point(s) almost at infinity brought nearer along their rays: {names}"
+    note = f"start values of {int(which.sum())} point(s) almost at infinity brought nearer along their rays: {_names(points.labels, which)}"
     return replace(network, points=replace(points, coordinates=seen.nearer(points.coordinates, which))), [*notes, note]
 
 
@@ -113,6 +120,7 @@ class _Search:
         self.fixed_frame = bool(known.any() or oriented.any())
         self.position, self.rotation = np.array(network.images.position), np.array(network.images.rotation)
         self.coordinates = np.array(network.points.coordinates)
+        self.far = np.zeros(len(known), dtype=bool)  # placed where their rays do not meet
         self.methods: list[str] = []
         self.why = ""
 
@@ -196,6 +204,7 @@ class _Search:
         self.coordinates[good] = seen.centres[good] + mean[good]
         self.coordinates = seen.nearer(self.coordinates, good)
         self.known |= good
+        self.far |= good
         return bool(good.any())
 
     def start_model(self) -> bool:

@@ -22,10 +22,12 @@ if TYPE_CHECKING:
     from baarda.adjustment.solve import Settings
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 REUSE = 1e-4  # relative step below which the factor of the last iteration serves the next ones
 SCALED = 0.1  # relative full step from which the columns are scaled anew
 NEAR = 1e-3  # relative step below which a full step is not tried before it is taken
+PATIENCE = 10  # iterations after which a free network looks for points that have become far
 BEND = 1e-7  # relative step above which steps are bent
 
 
@@ -146,6 +148,7 @@ def iterate(
     factor: Callable[..., Solver],
     settings: Settings,
     viewpoints: Viewpoints | None = None,
+    far: Bools | None = None,
 ) -> tuple[State, Linearization, list[Iteration], bool]:
     """Gauss-Newton with Levenberg's damping where a full step does not help.
 
@@ -158,7 +161,7 @@ def iterate(
     before: Floats | None = None  # the last full step, as a change of the observations
     straight = False  # whether the last step was neither damped nor bent nor lengthened
     viewpoints, largest = viewpoints or viewpoints_of(groups.groups, state), lin.scale
-    far = bool(viewpoints.far(state.points).any())
+    far = viewpoints.far(state.points) if far is None else far
 
     def moved(step: Floats) -> State:
         return state.moved(unknowns, step, viewpoints)
@@ -189,7 +192,7 @@ def iterate(
                     raise
                 before, solver, straight = None, None, False
                 continue
-        if far and datum.transfer is not None:
+        if far.any() and datum.transfer is not None:
             datum = datum.at(find_defect(lin, state))
         step, change = _step(lin, solver, datum, lin.misclosure)
         squares, bent = float(change @ change), False
@@ -225,6 +228,8 @@ def iterate(
         if control.settled(relative, plain) and (full or _full_step(lin, tied, factor) <= 1e-6):
             return state, lin, control.history, True
         control.relax(relative)
+        if tied.transfer is not None and len(control.history) % PATIENCE == 0 and (viewpoints.doubtful(state.points) & ~far).any():
+            break  # the datum hangs on points that prove to be far: see `baarda.adjustment.solve`
     return state, lin, control.history, False
 
 

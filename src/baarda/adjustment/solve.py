@@ -195,10 +195,16 @@ def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDAr
 
     viewpoints = viewpoints_of(groups, start)
     far = viewpoints.far(start.points)
-    datum = choose_datum(defect, lin, settings, prepared, far)
-    given = [lin]
-    del lin  # so that the iteration can let it go
-    state, lin, history, converged = iterate(prepared, start, given.pop(), arranged, datum, factor, settings, viewpoints)
+    while True:
+        datum = choose_datum(defect, lin, settings, prepared, far)
+        given = [lin]
+        del lin  # so that the iteration can let it go
+        state, lin, history, converged = iterate(prepared, start, given.pop(), arranged, datum, factor, settings, viewpoints, far)
+        more_far = (viewpoints.far(state.points) if converged else viewpoints.doubtful(state.points)) & ~far
+        if datum.transfer is None or not more_far.any():
+            break
+        far |= more_far  # a free network must not hang on them: once more from the start
+        lin = linearize(prepared, start, unknowns, arranged, settings.jobs)
     law = None
     if settings.robust is not None:
         found = adjust_under_law(prepared, state, lin, arranged, datum, factor, settings, redundancy, history)
@@ -342,10 +348,10 @@ def choose_datum(defect: Defect, lin: Linearization, settings: Settings, network
     on = np.zeros(unknowns.count)
     near = columns if far is None else columns[~far]
     left_out = 0 if far is None else int((columns[far] >= 0).any(axis=1).sum())
-    candidates = {f"all object points but {left_out} far one(s)": near[near >= 0]} if left_out else {}
-    candidates |= {
-        "all object points": columns[columns >= 0],
-        "all object points and images": images[images >= 0],
+    points = "all object points" + (f" but {left_out} far one(s)" if left_out else "")
+    candidates = {
+        points: near[near >= 0],
+        f"{points} and images": images[images >= 0],
         "all unknowns": np.arange(unknowns.count),  # as of a track over points that are held on one line
     }
     where, conditions = "", defect.basis

@@ -65,8 +65,9 @@ def for_each(items: Sequence[S], function: Callable[[S], T], workers: int | None
 
 def _together(work: Callable[[], None], stop: Callable[[BaseException], object], threads: int) -> None:
     """Do the same work in several threads, this one included; it ends by itself, or soon after an interruption was handed to `stop`."""
-    others = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
+    others: list[Future[None]] = []
     try:
+        others += [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
         work()
         _wait(others)
     except BaseException as error:  # an interruption outside a task

@@ -12,6 +12,7 @@ Ints = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
 FAR = 100.0  # times the base of its rays: beyond, a point's image coordinates are linear in the inverse of its distance
+DOUBTFUL = 30.0  # times the base
 FARTHEST = 1e9  # times the base: as near as a point comes to infinity on its way
 START = 1e4  # times the base: beyond, the distance hardly counts in 16 digits of a normal equation
 SMALL = 0.1  # part of its distance by which a near point moves straight
@@ -26,7 +27,7 @@ class Viewpoints:
     centres : (points, 3) array
         Mean place of the images that see a point, object units; NaN where none does.
     base : (points,) array
-        Their root mean square distance from it.
+        Their root mean square distance from it; NaN for points that are not to move as far ones.
     """
 
     centres: Floats
@@ -53,6 +54,10 @@ class Viewpoints:
     def far(self, points: Floats) -> Bools:
         """Return which points (n, 3) are so far that only their directions and inverse distances have nearly normal errors."""
         return self._beyond(points, FAR)
+
+    def doubtful(self, points: Floats) -> Bools:
+        """Return which points (n, 3) may prove to be far, if an adjustment stalls."""
+        return self._beyond(points, DOUBTFUL)
 
     def beyond_start(self, points: Floats) -> Bools:
         """Return which points (n, 3) are too far for a start: see `nearer`."""
@@ -96,7 +101,8 @@ class Viewpoints:
         out, ray = points + steps, points - self.centres
         square, along = np.einsum("ni,ni->n", ray, ray), np.einsum("ni,ni->n", steps, ray)
         reach = (FAR * self.base) ** 2
-        some = np.flatnonzero((np.abs(along) > SMALL * square) | ((square > reach) & (reach > 0.0)))  # false for NaN
+        outside = ~(square <= self.base**2)  # amid its images a point has no inverse distance to speak of
+        some = np.flatnonzero(((np.abs(along) > SMALL * square) & outside) | ((square > reach) & (reach > 0.0)))  # false for NaN
         if not len(some):
             return out
         ray, steps, s = ray[some], steps[some], along[some] / square[some]

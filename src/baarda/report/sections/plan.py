@@ -29,15 +29,17 @@ def _build(analysis: Analysis) -> list[Block] | None:
     table, sigmas = point_sigmas(analysis)
     whole = spatial(sigmas)
     unit = analysis.adjustment.network.unit
-    told, factor = finer(unit, whole[whole > 0.0])
+    told, factor = finer(unit, whole[(whole > 0.0) & ~almost_infinite(analysis)])
     points = np.stack([table[axis] for axis in ("X", "Y", "Z")], axis=1)
-    drawn = _sample(table["role"] == "tie")
+    infinite = almost_infinite(analysis)
+    finite = np.flatnonzero(~infinite)
+    drawn = finite[_sample((table["role"] == "tie")[finite])]
     # A camera looks along its -z axis: the third row of M, reversed.
     directions = -images.rotation[:, 2, :]
     svg = plots.plan(
         points[drawn], (whole * factor)[drawn], table["role"][drawn].tolist(), images.position, directions, images.labels, unit, told
     )
-    free = whole[(whole > 0.0) & ~almost_infinite(analysis)] * factor
+    free = whole[(whole > 0.0) & ~infinite] * factor
     sizes = (
         say(" from {low} to {high} {unit}", low=significant(free.min(), 2), high=significant(free.max(), 2), unit=told) if len(free) else ""
     )
@@ -51,7 +53,10 @@ def _build(analysis: Analysis) -> list[Block] | None:
     out = int((~((points[drawn] >= low) & (points[drawn] <= high)).all(axis=1)).sum())
     if out:
         caption += " " + say("{count} outside of the figure, far from the others.", count=plural(out, "point lies", "points lie"))
-    if len(drawn) < len(points):
+    if infinite.any():
+        count = plural(int(infinite.sum()), "point cannot be", "points cannot be")
+        caption += " " + say("{count} told from infinity.", count=count)
+    if len(drawn) < len(finite):
         caption += " " + say("Only {shown} points are drawn: those of the survey and an even sample of the others.", shown=len(drawn))
     alt = say(
         "Plan and elevation of {points} object points and {images} images. {caption}",

@@ -248,11 +248,11 @@ def _behind(analysis: Analysis) -> Iterator[Problem]:
 def _weak_points(analysis: Analysis) -> Iterator[Problem]:
     table, sigmas = point_sigmas(analysis)
     whole = spatial(sigmas)
-    free = whole > 0.0
+    free = (whole > 0.0) & ~almost_infinite(analysis)
     if free.sum() < 5:
         return
     median = float(np.median(whole[free]))
-    weak = np.flatnonzero((whole > _FAR * median) & ~almost_infinite(analysis))
+    weak = np.flatnonzero(free & (whole > _FAR * median))
     if len(weak):
         weak = weak[np.argsort(-whole[weak], kind="stable")]
         unit, factor = finer(analysis.adjustment.network.unit, whole[free])
