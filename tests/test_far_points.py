@@ -252,3 +252,18 @@ def test_the_report_names_them(tmp_path: Any) -> None:
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert f"{COUNT} points cannot be told from infinity." in page and f"{labels[0]} (beyond " in page
     assert "behind its camera" not in page
+
+
+def test_check_points_almost_at_infinity_are_told(tmp_path: Any) -> None:
+    network, truth, chosen = far_network(1e6)
+    roles, given = np.array(network.points.roles), np.array(network.points.given)
+    roles[chosen[0]], given[chosen[0]] = 2, truth.points.coordinates[chosen[0]]
+    points = replace(network.points, roles=roles, given=given)
+    project.write(replace(network, points=points), tmp_path / "block")
+    for language, told in (("en", "Check points are almost at infinity."), ("de", "sind fast unendlich fern.")):
+        done = CliRunner().invoke(
+            app, ["adjust", str(tmp_path / "block"), "--out", str(tmp_path / language), "--format", "project", "--language", language]
+        )
+        assert done.exit_code == 0, done.output
+        page = (tmp_path / language / "report.html").read_text(encoding="utf-8")
+        assert told in page and ("brought nearer" in page) == (language == "en")

@@ -229,6 +229,14 @@ def _almost_infinite(analysis: Analysis) -> Iterator[Problem]:
         "Their rays are almost parallel. Like stars they help to orient the images, but their coordinates and sigmas say nothing: leave "
         "them out of products."
     )
+    check = [a.network.points.labels[i] for i in found.points if a.network.points.roles[i] == CHECK]
+    if check:
+        yield (
+            "bad",
+            "Check points are almost at infinity.",
+            names(check, 6),
+            "Their coordinates say nothing, and tests and accuracy figures of check points that contain them say nothing: leave them out.",
+        )
     yield "warn", problem, evidence, advice
 
 
