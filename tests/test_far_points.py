@@ -173,7 +173,6 @@ def test_a_point_amid_its_images_is_not_far() -> None:
     network = replace(made, images=replace(made.images, position=made.images.position - shift))
     seen = viewpoints_of(network.observations, State.of(network))
     assert not seen.far(network.points.coordinates).any()
-    np.testing.assert_allclose(Viewpoints(np.zeros((1, 3)), np.ones(1)).moved(np.array([[0.5, 0, 0]]), np.array([[-0.5, 0, 0]])), 0.0)
 
 
 def test_near_points_move_by_the_inverse_distance_and_beyond_half_of_it_in_proportion() -> None:

@@ -101,8 +101,7 @@ class Viewpoints:
         out, ray = points + steps, points - self.centres
         square, along = np.einsum("ni,ni->n", ray, ray), np.einsum("ni,ni->n", steps, ray)
         reach = (FAR * self.base) ** 2
-        outside = ~(square <= self.base**2)  # amid its images a point has no inverse distance to speak of
-        some = np.flatnonzero(((np.abs(along) > SMALL * square) & outside) | ((square > reach) & (reach > 0.0)))  # false for NaN
+        some = np.flatnonzero((np.abs(along) > SMALL * square) | ((square > reach) & (reach > 0.0)))  # false for NaN
         if not len(some):
             return out
         ray, steps, s = ray[some], steps[some], along[some] / square[some]
