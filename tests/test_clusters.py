@@ -36,12 +36,13 @@ def found(blocks, width, compiled, monkeypatch):
     return first, members, ends, sparse, starts_in_clusters(blocks, first, members, ends, own, width, 2)
 
 
-@pytest.mark.parametrize("most", [40, 1024])
+@pytest.mark.parametrize(("most", "largest"), [(40, 700_000), (1024, 700_000), (1024, 5_000)])
 @pytest.mark.parametrize("points", [0, 1, 16, 17, 3000])
-def test_loops_and_twins_find_the_same(points, most, monkeypatch):
+def test_loops_and_twins_find_the_same(points, most, largest, monkeypatch):
     if cluster_loops.compiled() is None:
         pytest.skip("numba is not installed")
     monkeypatch.setattr(clusters, "MOST", most)
+    monkeypatch.setattr(clusters, "LARGEST", largest)
     monkeypatch.setattr(clusters, "SPARSE", 1.2)
     monkeypatch.setattr(clusters, "SHARE", 7)
     blocks, width = row_blocks(points, 50, points), np.random.default_rng(1).integers(1, 9, 50)
@@ -68,3 +69,25 @@ def test_a_cluster_holds_every_node_that_its_points_touch(compiled, monkeypatch)
         own = members[ends[c] : ends[c + 1]].tolist()
         assert own == sorted(touched - {-1})
         assert begins - {(-1, -1)} == {(node, 6 * j) for j, node in enumerate(own)}
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_clusters_are_limited_in_size(compiled, monkeypatch):
+    """Points times columns, unless the smallest cluster exceeds the limit already; without it clusters are larger."""
+    blocks, width = row_blocks(3000, 20, 6), np.full(20, 6)
+    largest = []
+    for limit in (5_000, 700_000):
+        monkeypatch.setattr(clusters, "LARGEST", limit)
+        first, members, ends, _, _ = found(blocks, width, compiled, monkeypatch)
+        columns = np.add.reduceat(width[members], ends[:-1])
+        largest.append(int((columns * np.diff(first)).max()))
+    assert largest[0] <= 5_000 < largest[1]
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_wide_clusters_of_points_that_touch_little_are_sparse(compiled, monkeypatch):
+    blocks, width = row_blocks(2000, 200, 7), np.full(200, 6)
+    monkeypatch.setattr(clusters, "OVERHEAD", 10**6)  # few, wide ones
+    assert found(blocks, width, compiled, monkeypatch)[3].any()
+    monkeypatch.setattr(clusters, "SPARSE", 1e9)
+    assert not found(blocks, width, compiled, monkeypatch)[3].any()

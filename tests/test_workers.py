@@ -1,6 +1,7 @@
 """Tasks of a few threads: results in order, failures, interruptions."""
 
 import threading
+import time
 
 import pytest
 
@@ -79,3 +80,16 @@ def test_trees_wait_for_what_comes_before():
     run_tree([0, 0, 2, 1], [[2], [2], [3], []], done.append, 3)
     assert sorted(done[:2]) == [0, 1]
     assert done[2:] == [2, 3]
+
+
+def test_of_two_failures_the_first_item_s_is_raised():
+    both = threading.Barrier(2)
+
+    def fail(x):
+        both.wait(timeout=60)
+        if x == 0:
+            time.sleep(0.2)  # it fails later
+        raise ValueError(x)
+
+    with pytest.raises(ValueError, match=r"^0$"):
+        for_each([0, 1], fail, workers=2)
