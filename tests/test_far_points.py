@@ -13,18 +13,22 @@ from scipy.optimize import least_squares
 from typer.testing import CliRunner
 
 import baarda
-from baarda.adjustment.far_points import far_points
+from baarda.adjustment.far_points import FarPoints
 from baarda.adjustment.linearize import whitened_misclosures
 from baarda.adjustment.solve import active_groups
 from baarda.cameras import FIXED, FREE
 from baarda.cli import app
 from baarda.formats import project
-from baarda.network import Network, State, Viewpoints, unknowns_of
+from baarda.network import CHECK, Network, State, Viewpoints, unknowns_of
 from baarda.observations import Distances, viewpoints_of
 from baarda.procedures.helmert import solve_blocked
 from baarda.procedures.partition_folder import write_partition
 from baarda.procedures.synthetic import synthetic
 from baarda.procedures.task_engines import open_engine
+from baarda.procedures.testing import analyse
+from baarda.report.sections import verdict
+from baarda.report.sections.base import DataTable
+from baarda.report.sections.points import POINTS
 
 COUNT = 4
 
@@ -86,7 +90,7 @@ def test_any_distance_is_adjusted_in_a_few_iterations(solver: str, factor: float
     assert found.status == "converged" and len(found.history) <= 11
     assert 0.7 < found.variance_factor < 1.3
     np.testing.assert_allclose(found.redundancy_numbers.sum(), found.redundancy, rtol=1e-6)
-    far = far_points(found, "apriori")
+    far = found.far
     assert set(far.points) == (set(chosen.tolist()) if factor >= 1e3 else set())
     assert (far.least > 3e4).all()  # flying height 1100 m
 
@@ -196,7 +200,7 @@ def test_robust_laws_follow(law: str) -> None:
     network, _, chosen = far_network(1e6)
     found = baarda.adjust(network, robust=law)
     assert found.status == "converged"
-    assert set(far_points(found, "apriori").points) == set(chosen.tolist())
+    assert set(found.far.points) == set(chosen.tolist())
 
 
 @pytest.mark.parametrize("factor", [1e2, 1e4, 1e9])
@@ -253,12 +257,16 @@ def test_the_report_names_them(tmp_path: Any) -> None:
     assert "behind its camera" not in page
 
 
-def test_check_points_almost_at_infinity_are_told(tmp_path: Any) -> None:
-    network, truth, chosen = far_network(1e6)
+def test_a_check_point_at_infinity_judges_nothing(tmp_path: Any) -> None:
+    network, truth, chosen = far_network(1e6, checks=3)
     roles, given = np.array(network.points.roles), np.array(network.points.given)
-    roles[chosen[0]], given[chosen[0]] = 2, truth.points.coordinates[chosen[0]]
-    points = replace(network.points, roles=roles, given=given)
-    project.write(replace(network, points=points), tmp_path / "block")
+    roles[chosen[0]], given[chosen[0]] = CHECK, truth.points.coordinates[chosen[0]]
+    network = replace(network, points=replace(network.points, roles=roles, given=given))
+    found = baarda.adjust(network)
+    assert found.judges.sum() == 3 and not found.judges[chosen].any()
+    check = found.evidence.check
+    assert check is not None and len(check.names) == 9
+    project.write(network, tmp_path / "block")
     for language, told in (("en", "Check points are almost at infinity."), ("de", "sind fast unendlich fern.")):
         done = CliRunner().invoke(
             app, ["adjust", str(tmp_path / "block"), "--out", str(tmp_path / language), "--format", "project", "--language", language]
@@ -266,3 +274,82 @@ def test_check_points_almost_at_infinity_are_told(tmp_path: Any) -> None:
         assert done.exit_code == 0, done.output
         page = (tmp_path / language / "report.html").read_text(encoding="utf-8")
         assert told in page and ("brought nearer" in page) == (language == "en")
+        rms = json.loads((tmp_path / language / "result.json").read_text(encoding="utf-8"))["rms"]["check"]
+        assert rms["x"] < 1.0 and rms["z"] < 2.0
+
+
+def test_which_points_are_told_and_how_far_they_are_at_least() -> None:
+    """By hand: |rho| < 3 sigma of the inverse distance, and the limit 1 / (rho + 1.645 sigma), rho negative behind the images."""
+    sides, told, apart = set(), 0, 0
+    for seed, factor in enumerate((8e2, 8e2, 1e5, 1e5)):
+        network, truth, chosen = far_network(factor, seed=seed)
+        found = baarda.adjust(network)
+        seen = viewpoints_of(found.groups, State.of(found.network))
+        least = dict(zip(found.far.points.tolist(), found.far.least.tolist(), strict=True))
+        for p in chosen.tolist():
+            ray, true = found.network.points.coordinates[p] - seen.centres[p], truth.points.coordinates[p] - seen.centres[p]
+            r = np.linalg.norm(ray)
+            unit = np.sign(ray @ true) * ray / r
+            rho, sigma = np.sign(ray @ true) / r, found.sigma0 * np.sqrt(unit @ found.point_cofactors[p] @ unit) / r**2
+            assert (p in least) == (abs(rho) < 3.0 * sigma)
+            if p in least:
+                limit = rho + 1.6448536269514722 * sigma
+                assert least[p] == pytest.approx(1.0 / limit if limit > 0.0 else np.inf, rel=1e-9)
+                sides.add(float(np.sign(rho)))
+                told += 1
+            else:
+                apart += 1
+    assert sides == {-1.0, 1.0} and told and apart
+
+
+def test_only_unknown_points_that_take_part_are_told() -> None:
+    network, _, chosen = far_network(1e6)
+    states, group = np.array(network.points.states), network.observations[0]
+    states[chosen[0], 2] = FIXED
+    one_ray = np.flatnonzero(group.points == chosen[1])[1:]  # set aside
+    keep = ~np.isin(np.arange(len(group)), one_ray)
+    network = replace(network, points=replace(network.points, states=states), observations=(group.selected(keep),))
+    found = baarda.adjust(network)
+    assert found.aside[chosen[1]]
+    assert set(found.far.points) <= set(chosen[2:].tolist())
+    start = found.start.points.coordinates
+    np.testing.assert_array_equal(start[chosen[:2]], network.points.coordinates[chosen[:2]])  # nor brought nearer
+
+
+def test_inner_constraints_leave_out_what_is_beyond_a_hundred_bases() -> None:
+    network, _, chosen = far_network(1.0, control=0)
+    seen = viewpoints_of(network.observations, State.of(network))
+    near, far = (seen.centres[chosen[:2]] + np.array([[0.0, 0.0, -f]]) * seen.base[chosen[:2], None] for f in (30.0, 150.0))
+    coordinates = np.array(network.points.coordinates)
+    coordinates[chosen[:2]] = near
+    assert not seen.far(coordinates).any()
+    coordinates[chosen[:2]] = far
+    assert set(np.flatnonzero(seen.far(coordinates))) == set(chosen[:2].tolist())
+
+
+def test_a_free_network_follows_a_robust_law() -> None:
+    network, _, chosen = far_network(1e5, control=0)
+    found = baarda.adjust(network, robust="huber", solver="block")
+    assert found.status == "converged"
+    assert set(found.far.points) == set(chosen.tolist())
+
+
+def test_precision_is_that_of_the_other_points() -> None:
+    network, _, chosen = far_network(1e6)
+    analysis = analyse(baarda.adjust(network))
+    names = {network.points.labels[i] for i in chosen}
+    sentence = next(s for s in verdict.sentences(analysis) if s.subject == "Precision").text
+    assert not any(f"point {name} " in sentence for name in names)
+    tables = [b for b in POINTS.build(analysis) or [] if isinstance(b, DataTable)]
+    assert all(float(cell) < 50.0 for row in tables[0].rows for cell in row[2:])
+    assert all(float(cell) < 50.0 for row in tables[1].rows for cell in row[3:])
+    assert not names & {row[0] for row in tables[2].rows}
+
+
+def test_where_all_points_are_almost_infinite_their_list_is_left() -> None:
+    network, _, _ = far_network(1.0)
+    analysis = analyse(baarda.adjust(network))
+    every = np.arange(len(network.points.labels))
+    analysis.adjustment.__dict__["far"] = FarPoints(every, np.full(len(every), 1e6))
+    tables = [b for b in POINTS.build(analysis) or [] if isinstance(b, DataTable)]
+    assert [t.caption for t in tables] == ["All points"] and len(tables[0].rows) == len(every)

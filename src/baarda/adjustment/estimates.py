@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from baarda.hypotheses.base import Estimates
-from baarda.network import AXES, CHECK
+from baarda.network import AXES
 from baarda.observations import CorrelatedPoints, Direct
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def removable(a: Adjustment) -> Estimates:
 def of_check_points(a: Adjustment) -> Estimates | None:
     """Return adjusted less given coordinates of the check points, with both cofactors; None without check points."""
     points = a.network.points
-    rows, axes = np.nonzero(((points.roles == CHECK) & ~a.aside)[:, None] & np.isfinite(points.given))
+    rows, axes = np.nonzero(a.judges[:, None] & np.isfinite(points.given))
     if not len(rows):
         return None
     q = a.cofactors.of(a.numbering["point"].columns.reshape(-1, 3)[rows, axes])

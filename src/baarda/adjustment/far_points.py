@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from baarda.adjustment.result import Adjustment, Scaling
 from baarda.cameras import FIXED
 from baarda.network import State
 from baarda.observations import ImagePoints, viewpoints_of
+
+if TYPE_CHECKING:
+    from baarda.adjustment.result import Adjustment
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -36,17 +39,11 @@ class FarPoints:
     least: Floats
 
 
-def far_points(a: Adjustment, sigma: Scaling) -> FarPoints:
+def far_points(a: Adjustment) -> FarPoints:
     """Return the points beyond 100 bases of their rays whose inverse distance is less than 3 of its standard deviations.
 
     Image coordinates are nearly linear in the inverse distance rho = 1/r, which may come out negative: the rays open, the point stands
-    behind its images. Its standard deviation is sigma_r / r^2, so that the ratio is r / sigma_r.
-
-    Parameters
-    ----------
-    a : Adjustment
-    sigma : {"aposteriori", "apriori"}
-        The variance factor of the standard deviations.
+    behind its images. Its standard deviation (a posteriori) is sigma_r / r^2, so that the ratio is r / sigma_r.
     """
     network, state = a.network, State.of(a.network)
     own = np.flatnonzero((network.points.states != FIXED).all(axis=1) & ~a.aside)
@@ -54,7 +51,7 @@ def far_points(a: Adjustment, sigma: Scaling) -> FarPoints:
     own = own[seen.base[own] > 0.0]
     ray = state.points[own] - seen.centres[own]
     r = np.linalg.norm(ray, axis=1)
-    deviation = a.scale(sigma) * np.sqrt(np.einsum("ni,nij,nj->n", ray, a.point_cofactors[own], ray)) / r
+    deviation = a.scale("aposteriori") * np.sqrt(np.einsum("ni,nij,nj->n", ray, a.point_cofactors[own], ray)) / r
     weak = np.flatnonzero(seen.far(state.points)[own] & (r < RESOLVED * deviation))
     own, r, deviation = own[weak], r[weak], deviation[weak]
     front = np.zeros(len(network.points.labels))  # rays with the point in front of the camera, less the others

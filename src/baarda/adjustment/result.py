@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from baarda.adjustment import estimates, tables
 from baarda.adjustment.covariance import Cofactors
 from baarda.adjustment.datum import Datum
+from baarda.adjustment.far_points import FarPoints, far_points
 from baarda.adjustment.linear_system import Chunk, Linearization
 from baarda.adjustment.linearize import offsets_of
 from baarda.adjustment.memory import release
@@ -21,7 +22,7 @@ from baarda.adjustment.solver import Solver
 from baarda.errors import UsageError
 from baarda.geometry import rotation as rot
 from baarda.hypotheses.base import Estimates, Evidence
-from baarda.network import Network, State, Table, Unknowns
+from baarda.network import CHECK, Network, State, Table, Unknowns
 from baarda.observations import CorrelatedPoints, Direct, ImageCoordinates, ImagePoints, Kind
 
 if TYPE_CHECKING:
@@ -136,17 +137,7 @@ class Adjustment:
     @cached_property
     def residuals(self) -> Floats:
         """v = adjusted - observed of all n observations, each in its unit."""
-        out = np.empty(self.count)
-        for c in self.lin.chunks:
-            correlated = c.correlated
-            for some in c.pieces():
-                rows, factor = c.rows_of(some), c.factor[some]
-                misclosure = self.lin.misclosure[rows]
-                if correlated:
-                    out[rows] = -(factor @ misclosure[:, :, None])[:, :, 0]
-                else:
-                    out[rows] = -np.einsum("nii->ni", factor) * misclosure
-        return out
+        return self._of_misclosures(lambda sigma, white: -white * sigma, lambda f, white: -(f @ white[:, :, None])[:, :, 0])
 
     @cached_property
     def sigmas(self) -> Floats:
@@ -155,6 +146,17 @@ class Adjustment:
         if all(not any(s.strides) and s.flat[0] == given[0].flat[0] for s in given):
             return np.broadcast_to(given[0].flat[0], (self.count,))
         return np.concatenate([s.ravel() for s in given])
+
+    def _of_misclosures(self, plain: Callable[[Floats, Floats], Floats], full: Callable[[Floats, Floats], Floats]) -> Floats:
+        """Put together one number of each observation, of standard deviations (N, m) or factors (N, m, m) and whitened misclosures."""
+        out = np.empty(self.count)
+        for c in self.lin.chunks:
+            correlated = c.correlated
+            for some in c.pieces():
+                rows, factor = c.rows_of(some), c.factor[some]
+                white = self.lin.misclosure[rows]
+                out[rows] = full(factor, white) if correlated else plain(np.einsum("nii->ni", factor), white)
+        return out
 
     @cached_property
     def _shares(self) -> tuple[Floats, dict[int, Floats]]:
@@ -214,17 +216,9 @@ class Adjustment:
     @cached_property
     def pv(self) -> Floats:
         """P v."""
-        out = np.empty(self.count)
-        for c in self.lin.chunks:
-            correlated = c.correlated
-            for some in c.pieces():
-                rows, factor = c.rows_of(some), c.factor[some]
-                white = self.lin.misclosure[rows]
-                if correlated:
-                    out[rows] = -(np.linalg.inv(factor).transpose(0, 2, 1) @ white[:, :, None])[:, :, 0]
-                else:
-                    out[rows] = -white / np.einsum("nii->ni", factor)
-        return out
+        return self._of_misclosures(
+            lambda sigma, white: -white / sigma, lambda f, white: -(np.linalg.inv(f).transpose(0, 2, 1) @ white[:, :, None])[:, :, 0]
+        )
 
     @cached_property
     def pqvvp(self) -> Floats:
@@ -440,6 +434,21 @@ class Adjustment:
     def image_table(self, sigma: Scaling) -> Table:
         """Return exterior orientation with sigmas, number of points and rms of the residuals of each image."""
         return tables.image_table(self, sigma)
+
+    @cached_property
+    def far(self) -> FarPoints:
+        """The points that cannot be told from infinity; none is sought where the adjustment did not converge."""
+        if self.status != "converged":
+            return FarPoints(np.zeros(0, dtype=np.intp), np.zeros(0))
+        return far_points(self)
+
+    @cached_property
+    def judges(self) -> NDArray[np.bool_]:
+        """Which points judge as check points: those that took part, but not what cannot be told from infinity."""
+        out = np.asarray((self.network.points.roles == CHECK) & ~self.aside)
+        if out.any():
+            out[self.far.points] = False
+        return out
 
     @cached_property
     def behind(self) -> list[tuple[str, str]]:

@@ -19,7 +19,7 @@ from baarda.adjustment.result import Adjustment
 from baarda.adjustment.solver import Solver
 from baarda.hypotheses.levels import Options
 from baarda.hypotheses.outliers import TauLaw, external_reliability, mdb, standardised
-from baarda.network import CHECK, Table
+from baarda.network import Table
 from baarda.observations import ImagePoints
 from baarda.procedures.external_reliability import MOST, external_effects
 from baarda.procedures.helmert_part import Tie, tied
@@ -423,7 +423,7 @@ def _plain(value: Any) -> Any:
 def _check_points(a: PartAdjustment) -> tuple[dict[str, Any], ...]:
     """Return differences and a-posteriori standard deviations of the check points."""
     points = a.network.points
-    rows = np.flatnonzero((points.roles == CHECK) & ~a.aside)
+    rows = np.flatnonzero(a.judges)
     if not len(rows):
         return ()
     d = points.coordinates[rows] - points.given[rows]

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from baarda.adjustment import Adjustment
-from baarda.adjustment.far_points import far_points
 from baarda.adjustment.parameter_hypotheses import Collinearity
 from baarda.formats.folder import Mark
 from baarda.hypotheses.base import TestResult
@@ -77,7 +76,7 @@ def result_json(analysis: Analysis) -> dict[str, Any]:
         else {"name": a.law.name, "values": a.law.values, "covariance_factor": a.law.covariance_factor, "resistance": a.law.resistance},
         "assumptions": list(a.assumptions),
         "points_set_aside": [net.points.labels[i] for i in np.flatnonzero(a.aside)],
-        "points_almost_infinite": [net.points.labels[i] for i in far_points(a, used).points] if analysis.converged else [],
+        "points_almost_infinite": [net.points.labels[i] for i in a.far.points],
         "unknowns": camera + fixed,
         "correlations": [{"a": x, "b": y, "value": r} for x, y, r in a.camera_correlations()] if analysis.converged else [],
         **_collinearity(analysis.collinearity if analysis.converged else None),
@@ -194,7 +193,7 @@ def _rms(a: Adjustment) -> dict[str, Any]:
             values = a.residuals[a.offsets[g] : a.offsets[g + 1]]
             out["control"] = {axis.lower(): _root(values[group.positions == k]) for k, axis in enumerate("XYZ")}
     points = a.network.points
-    d = (points.coordinates - points.given)[(points.roles == 2) & ~a.aside]
+    d = (points.coordinates - points.given)[a.judges]
     if len(d):
         by_axis = [_root(d[np.isfinite(d[:, k]), k]) for k in range(3)]
         both, full = d[np.isfinite(d[:, :2]).all(axis=1)], d[np.isfinite(d).all(axis=1)]

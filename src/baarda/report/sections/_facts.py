@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from baarda.adjustment.far_points import far_points
 from baarda.cameras import FIXED
 from baarda.hypotheses.base import TestResult
 from baarda.network import AXES, CONTROL
@@ -183,7 +182,7 @@ def almost_infinite(analysis: Analysis) -> NDArray[np.bool_]:
     """Return which rows of the point table are of points that cannot be told from infinity."""
     a = analysis.adjustment
     which = np.zeros(len(a.aside), dtype=bool)
-    which[far_points(a, analysis.options.sigma).points] = True
+    which[a.far.points] = True
     return which[~a.aside]
 
 

@@ -120,7 +120,7 @@ def _figures(a: Accuracy, told: str, factor: float) -> DataTable:
 
 def _vectors(analysis: Analysis, unit: str) -> list[Block]:
     points = analysis.adjustment.network.points
-    at = np.flatnonzero((points.roles == 2) & ~analysis.adjustment.aside & np.isfinite(points.given).any(axis=1))
+    at = np.flatnonzero(analysis.adjustment.judges & np.isfinite(points.given).any(axis=1))
     d = (points.coordinates - points.given)[at]
     if not len(at) or not np.isfinite(d).any():
         return []

@@ -118,18 +118,19 @@ def _build(analysis: Analysis) -> list[Block] | None:
     table, sigmas = point_sigmas(analysis)
     whole = spatial(sigmas)
     infinite = almost_infinite(analysis)
-    free = np.flatnonzero((whole > 0.0) & ~infinite)
-    if not len(free):
+    if not (whole > 0.0).any():
         return None
+    free = np.flatnonzero((whole > 0.0) & ~infinite)
     finite = sigmas[~infinite]
     unit, factor = finer(analysis.adjustment.network.unit, finite[finite > 0.0])
     blocks: list[Block] = []
     if infinite.any():
         count = plural(int(infinite.sum()), "point cannot be", "points cannot be")
         blocks.append(Paragraph(say("{count} told from infinity; only the list of all points holds them.", count=count)))
-    blocks.append(_summary(finite, np.asarray(table["rays"], dtype=float)[~infinite], unit, factor))
-    axes = {name: table[name][~infinite] for name in ("ellipse_a", "ellipsoid_a")}
-    blocks.append(_expanded(analysis, axes, finite, unit, factor))
+    if len(free):
+        blocks.append(_summary(finite, np.asarray(table["rays"], dtype=float)[~infinite], unit, factor))
+        axes = {name: table[name][~infinite] for name in ("ellipse_a", "ellipsoid_a")}
+        blocks.append(_expanded(analysis, axes, finite, unit, factor))
     worst = free[np.argsort(-whole[free], kind="stable")][:_WORST]
     if len(free) > _WORST:
         blocks.append(_table(analysis, table, sigmas, worst, say("The {count} weakest points", count=len(worst))))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from baarda.adjustment.far_points import RESOLVED, far_points
+from baarda.adjustment.far_points import RESOLVED
 from baarda.network import CHECK
 from baarda.observations import ImagePoints
 from baarda.procedures.testing import Analysis
@@ -214,7 +214,7 @@ def _uncontrolled(analysis: Analysis) -> Iterator[Problem]:
 
 def _almost_infinite(analysis: Analysis) -> Iterator[Problem]:
     a = analysis.adjustment
-    found = far_points(a, analysis.options.sigma)
+    found = a.far
     if not len(found.points):
         return
     shown = []
@@ -232,10 +232,10 @@ def _almost_infinite(analysis: Analysis) -> Iterator[Problem]:
     check = [a.network.points.labels[i] for i in found.points if a.network.points.roles[i] == CHECK]
     if check:
         yield (
-            "bad",
+            "warn",
             "Check points are almost at infinity.",
             names(check, 6),
-            "Their coordinates say nothing, and tests and accuracy figures of check points that contain them say nothing: leave them out.",
+            "Their coordinates say nothing: tests and accuracy figures of check points leave them out.",
         )
     yield "warn", problem, evidence, advice
 
@@ -300,8 +300,7 @@ def _aside(analysis: Analysis) -> Iterator[Problem]:
 
 
 def _survey(analysis: Analysis) -> Iterator[Problem]:
-    points = analysis.adjustment.network.points
-    count = int(((points.roles == CHECK) & ~analysis.adjustment.aside).sum())
+    count = int(analysis.adjustment.judges.sum())
     check, control = result_of(analysis, "check_points"), result_of(analysis, "control_points")
     if control is not None and control.rejected:
         each = result_of(analysis, "control_point")
