@@ -29,18 +29,32 @@ class Defect:
         Directions of the unknowns that change no observation.
     free : tuple of str
         The basic transformations that are free each by itself.
+    motions : (7, d) array
+        The shifts, rotations (radians) and scalings (shares) that `basis` shows at one state; at any other they are free as well.
     """
 
     basis: Floats
     free: tuple[str, ...]
+    motions: Floats
 
     @property
     def count(self) -> int:
         """The number d of freedoms."""
         return int(self.basis.shape[1])
 
+    def at(self, unknowns: Unknowns, state: State) -> Defect:
+        """Return the same transformations as they change the unknowns at another state."""
+        return replace(self, basis=similarity_directions(unknowns, state, size=1.0) @ self.motions)
 
-def similarity_directions(unknowns: Unknowns, state: State, some: Ints | None = None) -> Floats:
+
+def mean_distance(state: State) -> float:
+    """Return the root mean square distance of points and images from the origin, 1 where there is none."""
+    known = state.points[np.isfinite(state.points).all(axis=1)]
+    everything = np.concatenate([known, state.position])
+    return (float(np.sqrt((everything**2).sum(axis=1).mean())) if len(everything) else 0.0) or 1.0
+
+
+def similarity_directions(unknowns: Unknowns, state: State, some: Ints | None = None, size: float | None = None) -> Floats:
     """Return how the unknowns change under shifts, rotations and scaling of the object space, (u, 7).
 
     Parameters
@@ -50,25 +64,24 @@ def similarity_directions(unknowns: Unknowns, state: State, some: Ints | None = 
         Coordinates near the origin (reduced to the centroid).
     some : (k,) int array, optional
         Unknowns; all, if not given.
+    size : float, optional
+        Rotation and scale are stated per this length; by default `mean_distance`, which makes all columns of one magnitude.
 
     Returns
     -------
     (u, 7) or (k, 7) array
-        Rotation and scale are stated per mean distance from the origin, so that all columns are of one magnitude.
     """
+    length = mean_distance(state) if size is None else size
 
     def moved(x: Floats) -> Floats:
         shift = np.broadcast_to(np.eye(3), (len(x), 3, 3))
-        return np.concatenate([shift, -skew(x) / size, x[:, :, None] / size], axis=2)  # omega x X = -[X]x omega
+        return np.concatenate([shift, -skew(x) / length, x[:, :, None] / length], axis=2)  # omega x X = -[X]x omega
 
     def image(nodes: Ints) -> Floats:
         turn = np.zeros((len(nodes), 3, 7))
-        turn[:, :, 3:6] = -state.rotation[nodes] / size
+        turn[:, :, 3:6] = -state.rotation[nodes] / length
         return np.concatenate([moved(state.position[nodes]), turn], axis=1)
 
-    known = state.points[np.isfinite(state.points).all(axis=1)]
-    everything = np.concatenate([known, state.position])
-    size = (float(np.sqrt((everything**2).sum(axis=1).mean())) if len(everything) else 0.0) or 1.0
     of_nodes = {"image": (6, image), "point": (3, lambda nodes: moved(state.points[nodes]))}
     declared = {d.kind: d for d in state.declared}
     place = np.arange(unknowns.count + 1) if some is None else np.full(unknowns.count + 1, -1)
@@ -84,7 +97,7 @@ def similarity_directions(unknowns: Unknowns, state: State, some: Ints | None = 
             nodes = np.flatnonzero((to >= 0).any(axis=1))
             to, values = to[nodes].ravel(), directions(nodes).reshape(-1, 7)
         else:
-            values = declared[group.kind].similarity(size) if group.kind in declared else np.zeros((len(to), 7))
+            values = declared[group.kind].similarity(length) if group.kind in declared else np.zeros((len(to), 7))
         out[to[to >= 0]] = values[to >= 0]
     return out
 
@@ -111,11 +124,13 @@ def find_defect(lin: Linearization, state: State) -> Defect:
         squares, g = a.multiply(a).tocsr(), similarity_directions(lin.unknowns, state, used)
         found = free_combinations(*products(lambda w: squares @ w, lambda w: squares.T @ w, lambda x: a @ x, g))
         if not found[0].shape[1]:
-            return Defect(np.zeros((lin.unknowns.count, 0)), ())  # what some rows determine is determined
-    g = similarity_directions(lin.unknowns, state)
+            return Defect(np.zeros((lin.unknowns.count, 0)), (), np.zeros((7, 0)))  # what some rows determine is determined
+    size = mean_distance(state)
+    g = similarity_directions(lin.unknowns, state, size=size)
     combinations, free = free_combinations(*products(lin.row_sums, lin.column_sums, lin.times, g))
-    basis = g @ combinations
-    return Defect(np.linalg.qr(basis)[0] if basis.shape[1] else basis, free)
+    if combinations.shape[1]:  # orthonormal by R^-1, not Q: what does not move stays exactly zero (a column of K3 in pixels holds 1e18)
+        combinations = combinations @ np.linalg.inv(np.linalg.qr(g @ combinations, mode="r"))
+    return Defect(g @ combinations, free, combinations / np.repeat([1.0, size], [3, 4])[:, None])
 
 
 def products(
@@ -222,9 +237,9 @@ class Datum:
         g = self.defect.basis
         return np.asarray(np.linalg.solve((self.conditions.T @ g).T, g.T).T)
 
-    def at(self, defect: Defect) -> Datum:
-        """Return the same conditions with the free transformations at another state, where points far away move by other amounts."""
-        return replace(self, defect=defect) if defect.count == self.defect.count else self
+    def at(self, unknowns: Unknowns, state: State) -> Datum:
+        """Return the same conditions with the free transformations as they change the unknowns at another state."""
+        return replace(self, defect=self.defect.at(unknowns, state))
 
     def transform(self, x: Floats) -> Floats:
         """Apply S to vectors of unknowns, (u,) or (u, k)."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from baarda.adjustment.datum import Datum, find_defect
+from baarda.adjustment.datum import Datum
 from baarda.adjustment.linear_system import Linearization
 from baarda.adjustment.linearize import Arrangement, linearize, whitened_misclosures
 from baarda.adjustment.result import Iteration
@@ -178,7 +178,7 @@ def iterate(
         return whitened_misclosures(network, there, groups, workers)
 
     tied, unknowns, workers = datum, lin.unknowns, lin.workers
-    untied = replace(datum, held=np.zeros(0, dtype=np.intp), conditions=None)  # damping ties the datum down by itself
+    untied = replace(datum, held=np.zeros(0, dtype=np.intp), conditions=None)  # damping ties the datum down, elsewhere; see `brought_back`
     solver: Solver | None = None
     for _ in range(settings.iterations):
         datum = untied if control.damping > 0.0 else tied
@@ -192,9 +192,9 @@ def iterate(
                     raise
                 before, solver, straight = None, None, False
                 continue
-        if far.any() and datum.transfer is not None:
-            datum = datum.at(find_defect(lin, state))
-        step, change = _step(lin, solver, datum, lin.misclosure)
+        if datum.transfer is not None:
+            datum = datum.at(unknowns, state)
+        step, change = _step(solver, datum, lin.misclosure)
         squares, bent = float(change @ change), False
         relative, lengthened, plain = control.relative(squares), 1.0, straight
         if control.damping == 0.0 and before is not None and relative < 0.01:
@@ -239,13 +239,10 @@ def _squares(values: Floats) -> float:
         return float(values @ values) if np.isfinite(values).all() else np.inf
 
 
-def _step(lin: Linearization, solver: Solver, datum: Datum, y: Floats) -> tuple[Floats, Floats]:
+def _step(solver: Solver, datum: Datum, y: Floats) -> tuple[Floats, Floats]:
     """Return the step x that fits A x to y best, in the datum asked for, and A x."""
     step, change = solver.least_squares(y)
-    if datum.transfer is None:
-        return step, change
-    step = datum.transform(step)
-    return step, lin.times(step)  # the free transformations are those of the start values: they change the observations a little
+    return datum.transform(step), change
 
 
 def _full_step(lin: Linearization, datum: Datum, factor: Callable[..., Solver]) -> float:
@@ -266,6 +263,6 @@ def _bent(
     curvature *= 2.0 / h
     if not np.isfinite(curvature).all():
         return step
-    bend = -0.5 * _step(lin, solver, datum, curvature)[0]
+    bend = -0.5 * _step(solver, datum, curvature)[0]
     size = np.linalg.norm(lin.scale * bend) / np.linalg.norm(lin.scale * step)
     return step + bend if size <= 0.375 else step

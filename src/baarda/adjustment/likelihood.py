@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from baarda.adjustment.datum import Datum, find_defect
+from baarda.adjustment.datum import Datum
 from baarda.adjustment.linear_system import Linearization
 from baarda.adjustment.linearize import Arrangement, linearize, whitened_misclosures
 from baarda.adjustment.result import Iteration
@@ -109,7 +109,6 @@ def iterate(
     damping, growth, last = 0.0, 2.0, np.inf
     reach = np.full(lin.count, REACH[1])
     viewpoints = viewpoints_of(groups.groups, state)
-    far = bool(viewpoints.far(state.points).any())
     for count in range(1, settings.iterations + 1):
         u = lin.misclosure / scale
         slope = (law.score(u - reach) - law.score(u + reach)) / (2.0 * reach)
@@ -121,9 +120,8 @@ def iterate(
         step = solver.solve(rhs)
         if damping == 0.0:
             step = _newton_step(lin, solver, slope, u, psi, rhs, step, scale)
-        if far and datum.transfer is not None:
-            datum = datum.at(find_defect(lin, state))
-        step = datum.transform(step)
+        if datum.transfer is not None:
+            step = datum.at(lin.unknowns, state).transform(step)
         change = lin.times(step)
         relative = float(np.sqrt(change @ (curvature * change) / r) / scale)
         slope_along = float(step @ rhs) / scale**2

@@ -16,6 +16,7 @@ from baarda.adjustment.camera_choice import with_cameras
 from baarda.adjustment.connection import separate_parts
 from baarda.adjustment.datum import Datum, Defect, find_defect, minimal_columns
 from baarda.adjustment.dense import DenseSolver
+from baarda.adjustment.free_motion import brought_back
 from baarda.adjustment.initial import complete
 from baarda.adjustment.iteration import iterate
 from baarda.adjustment.linear_system import Linearization
@@ -210,7 +211,13 @@ def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDAr
         found = adjust_under_law(prepared, state, lin, arranged, datum, factor, settings, redundancy, history)
         state, lin, history, converged, law = found
         more = [*more, *law.assumptions]
-    datum = choose_datum(find_defect(lin, state) if defect.count else defect, lin, settings, prepared, far)
+    there = brought_back(state, start, unknowns, datum) if converged and defect.count else state
+    if there is not state:
+        state, lin = there, linearize(prepared, there, unknowns, arranged, settings.jobs)
+    if datum.name == "inner":
+        datum = choose_datum(find_defect(lin, state), lin, settings, prepared, far)
+    elif datum.name == "minimal":  # it names what was held
+        datum = datum.at(lin.unknowns, state)
     memory.release(lin.count)
     solver = factor(lin, datum)
     return Adjustment(

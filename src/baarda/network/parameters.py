@@ -275,6 +275,21 @@ class State:
             tuple(d.moved(padded[unknowns[d.kind].columns]) for d in self.declared),
         )
 
+    def departure(self, unknowns: Unknowns, other: State) -> Floats:
+        """Return the increments of the unknowns that lead from another state to this one, (u,); of angles those about the camera axes."""
+        turn = rot.log(self.rotation @ other.rotation.transpose(0, 2, 1)) if len(self.rotation) else np.zeros((0, 3))
+        parts = {
+            "camera": np.concatenate([np.zeros(0), *(a - b for a, b in zip(self.cameras, other.cameras, strict=True))]),
+            "image": np.concatenate([self.position - other.position, turn], axis=1).ravel(),
+            "point": (self.points - other.points).ravel(),
+        }
+        parts |= {d.kind: d.departure(other[d.kind]) for d in self.declared}
+        out = np.empty(unknowns.count)
+        for group in unknowns.groups:
+            used = group.columns >= 0
+            out[group.columns[used]] = parts[group.kind][used]
+        return out
+
     def shifted(self, shift: Floats) -> State:
         """Return the state with `shift` added to all object coordinates."""
         declared = tuple(d.shifted(shift) for d in self.declared)

@@ -37,6 +37,10 @@ class JointDatum:
     inverse : (d, d) array
         (B'G)^-1.
     text : str
+    free : Tie or None
+        As `tie`, also of a minimal datum, whose conditions are over no kind of unknowns but `pins`.
+    pins : tuple of (k, 2) int arrays
+        For each part the columns of unknowns that a minimal datum holds, each with its number among all d of them.
     """
 
     name: str
@@ -46,6 +50,8 @@ class JointDatum:
     tie: tasks.Tie | None
     inverse: Floats
     text: str
+    free: tasks.Tie | None
+    pins: tuple[Ints, ...]
 
 
 def find_defect(parts: Parts, stands: Handles) -> tuple[Floats, tuple[str, ...], list[tasks.DatumSums]]:
@@ -67,17 +73,17 @@ def choose_datum(parts: Parts, stands: Handles, settings: Settings, at_start: bo
     d = basis.shape[1]
     if not d:
         text = "The datum is defined by the observations and known values (defect 0)."
-        return JointDatum("control", 0, (none,) * count, none, None, np.zeros((0, 0)), text)
+        return JointDatum("control", 0, (none,) * count, none, None, np.zeros((0, 0)), text, None, ())
     free = ", ".join(single) if len(single) == d else f"{d} combination(s) of shifts, rotations and scale"
     if settings.datum == "control":
         raise DatumDefect(
             f"the known values do not define the datum: free are {free} (datum defect {d}); "
             "add control, or choose inner or minimal constraints (--datum inner)"
         )
-    held, border, names = _held(parts, stands, basis, free)
+    held, border, names, pins = _held(parts, stands, basis, free)
     if settings.datum == "minimal":
         text = f"Minimal constraints hold {d} unknown(s) at their start values: {names}."
-        return JointDatum("minimal", d, held, border, None, np.zeros((0, 0)), text)
+        return JointDatum("minimal", d, held, border, None, np.zeros((0, 0)), text, tasks.Tie(parts.joint.size, basis, (), at_start), pins)
     kinds: tuple[str, ...] = ("point",)
     far = sum(s.far for s in sums)
     where = "all object points" + (f" but {far} far one(s)" if far else "")
@@ -86,11 +92,11 @@ def choose_datum(parts: Parts, stands: Handles, settings: Settings, at_start: bo
     tie = tasks.Tie(parts.joint.size, basis, kinds, at_start)
     inverse = np.linalg.inv(parts.total(tasks.gram, stands, tie))
     text = f"Free network: {d} inner constraint(s) over {where} tie down {free}."
-    return JointDatum("inner", d, held, border, tie, inverse, text)
+    return JointDatum("inner", d, held, border, tie, inverse, text, tie, (np.zeros((0, 2), dtype=np.intp),) * count)
 
 
-def _held(parts: Parts, stands: Handles, basis: Floats, free: str) -> tuple[tuple[Ints, ...], Ints, str]:
-    """Choose d orientation unknowns whose fixing removes the defect, best conditioned."""
+def _held(parts: Parts, stands: Handles, basis: Floats, free: str) -> tuple[tuple[Ints, ...], Ints, str, tuple[Ints, ...]]:
+    """Choose d orientation unknowns whose fixing removes the defect, best conditioned: in the parts, in the border, names, pins."""
     d = basis.shape[1]
     found = parts.all(tasks.candidates, stands, parts.joint.size, basis)
     border = np.full(parts.joint.border, -1)
@@ -125,4 +131,7 @@ def _held(parts: Parts, stands: Handles, basis: Floats, free: str) -> tuple[tupl
     asked = [parts.engine.submit(k, tasks.names_of, s, h) for k, (s, h) in enumerate(zip(stands, held, strict=True)) if len(h)]
     for more in parts.engine.gather(asked):
         names += more
-    return held, top, ", ".join(names)
+    pins = tuple(
+        np.array([(column[i], j) for j, i in enumerate(chosen) if part[i] == k], dtype=np.intp).reshape(-1, 2) for k in range(count)
+    )
+    return held, top, ", ".join(names), pins

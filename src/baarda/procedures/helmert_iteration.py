@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from baarda.adjustment.free_motion import back
 from baarda.adjustment.iteration import REUSE, Control, extrapolation
 from baarda.adjustment.result import Iteration
 from baarda.adjustment.solve import Settings
@@ -17,6 +18,7 @@ from baarda.procedures.helmert_border import Handles, Joint, Parts, Top
 from baarda.procedures.helmert_datum import JointDatum, choose_datum
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,8 @@ class Run:
         steps = self.parts.each(tasks.expanded, self.stands, values, [x[at] for at in self.joint.at])
         if datum is None or datum.tie is None:
             return steps
-        t = datum.inverse @ self.parts.total(tasks.condition_sums, self.stands, steps, datum.tie)
-        return self.parts.each(tasks.transferred, self.stands, steps, datum.tie, t)
+        sums = self.parts.total(tasks.condition_sums, self.stands, steps, datum.tie)
+        return self.parts.each(tasks.transferred, self.stands, steps, datum.tie, np.linalg.solve(sums[:, 1:], sums[:, 0]))
 
     def bent(self, datum: JointDatum | None, steps: Handles) -> Handles:
         """Add the second-order correction to a step, where it is smaller than the step."""
@@ -121,6 +123,15 @@ class Run:
         self.factor(datum, 0.0, None)
         cc = self.sums(self.solved(replace(datum, tie=None)), None).cc
         return float(np.sqrt(cc) / max(np.sqrt(objective), 1e-4 * np.sqrt(self.joint.count)))
+
+    def brought_back(self, free: tasks.Tie, pins: Sequence[Ints]) -> Handles:
+        """Return the parts where the conditions of the datum hold, see `baarda.adjustment.free_motion`."""
+
+        def drift(stands: Handles) -> Floats:
+            return np.asarray(self.parts.total(tasks.drift, stands, free, list(pins)))
+
+        motions = free.basis / np.repeat([1.0, free.size], [3, 4])[:, None]
+        return back(self.stands, motions, free.size, drift, lambda stands, motion: self.parts.each(tasks.carried_along, stands, motion))
 
     def solve(self, stands: Handles) -> Blocked:
         """Iterate to the minimum as `baarda.adjustment.iteration.iterate`, and factor there."""
@@ -167,6 +178,8 @@ class Run:
                 break
             control.relax(relative)
         old = before = None
-        datum = choose_datum(parts, self.stands, settings, False) if tied.count else tied
+        if converged and tied.free is not None:
+            self.stands = self.brought_back(tied.free, tied.pins)
+        datum = tied if tied.tie is None else choose_datum(parts, self.stands, settings, False)
         self.factor(datum, 0.0, None)
         return Blocked(joint, datum, self.stands, self.top, control.objective, redundancy, tuple(control.history), converged)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from baarda.adjustment.block import BlockSolver
 from baarda.adjustment.datum import products, similarity_directions
+from baarda.adjustment.free_motion import carried
 from baarda.adjustment.linearize import check_finite, whitened_misclosures
 from baarda.adjustment.solve import Settings
 from baarda.errors import UsageError
@@ -123,12 +124,7 @@ def _owned_nodes(part: Part, kind: str, count: int) -> Bools:
 
 def directions(part: Part, state: State, size: float) -> Floats:
     """Return the seven similarity directions of the part's unknowns, rotation and scale per the network's size."""
-    known = state.points[np.isfinite(state.points).all(axis=1)]
-    everything = np.concatenate([known, state.position])
-    own = (float(np.sqrt((everything**2).sum(axis=1).mean())) if len(everything) else 0.0) or 1.0
-    g = similarity_directions(part.unknowns, state)
-    g[:, 3:] *= own / size
-    return g
+    return similarity_directions(part.unknowns, state, size=size)
 
 
 class DatumSums(NamedTuple):
@@ -213,7 +209,7 @@ class Tie:
     kinds : tuple of str
         Kinds of unknowns that the constraints are over.
     at_start : bool
-        Whether the directions are those at the start values.
+        Whether the conditions B hold the directions at the start values.
     """
 
     size: float
@@ -225,16 +221,12 @@ class Tie:
 def tied(stand: Stand, tie: Tie) -> tuple[Floats, Floats]:
     """Return the basis G (u, d) and the conditions B (u, d) of a part; rows of the border that another part owns are left out of B."""
     part = stand.part
-    g = directions(part, part.start if tie.at_start else stand.state, tie.size)
-    if tie.at_start and part.far.any():  # they may have moved as far again
-        far = part.unknowns["point"].columns.reshape(-1, 3)[part.far]
-        far = far[far >= 0]
-        g[far] = directions(part, stand.state, tie.size)[far]
-    g = g @ tie.basis
+    g = directions(part, stand.state, tie.size) @ tie.basis
+    b = directions(part, part.start, tie.size) @ tie.basis if tie.at_start else g
     on = np.zeros(len(g), dtype=bool)
     for kind in tie.kinds:
         on |= _of_kind(part, kind)
-    return g, g * (on & part.owned)[:, None]
+    return g, b * (on & part.owned)[:, None]
 
 
 # ---- one step -------------------------------------------------------------------------------------------------------------------------
@@ -301,16 +293,35 @@ def expanded(stand: Stand, y: Step | None, border: Floats) -> Step:
 
 
 def condition_sums(stand: Stand, step: Step, tie: Tie) -> Floats:
-    """Return B'x of a part, (d,)."""
-    found = np.asarray(tied(stand, tie)[1].T @ step.x)
+    """Return B'x and B'G of a part, (d, 1 + d)."""
+    g, b = tied(stand, tie)
     stand.rest()
-    return found
+    return np.asarray(b.T @ np.column_stack([step.x, g]))
 
 
 def transferred(stand: Stand, step: Step, tie: Tie, t: Floats) -> Step:
     """Return the step moved along the free directions, x - G t, into the datum asked for."""
-    x = step.x - tied(stand, tie)[0] @ t
-    found = Step(x, stand.lin.times(x))
+    g, _ = tied(stand, tie)
+    stand.rest()
+    return Step(step.x - g @ t, step.change)
+
+
+def drift(stand: Stand, tie: Tie, pins: Ints) -> Floats:
+    """Return by how much a part's state misses the datum of the start, and how the free transformations change that, (d, 1 + d).
+
+    `pins` (k, 2): columns of unknowns of a minimal datum, each with its number among all d of them.
+    """
+    part = stand.part
+    g, b = tied(stand, tie)
+    b[pins[:, 0], pins[:, 1]] = 1.0
+    found = np.asarray(b.T @ np.column_stack([stand.state.departure(part.unknowns, part.start), g]))
+    stand.rest()
+    return found
+
+
+def carried_along(stand: Stand, motion: Floats) -> Stand:
+    """Return the part at its state after a free transformation."""
+    found = Stand(stand.part, carried(stand.state, stand.part.unknowns, motion))
     stand.rest()
     return found
 

@@ -20,7 +20,6 @@ from threadpoolctl import threadpool_limits
 
 from baarda.adjustment import Adjustment, adjust
 from baarda.errors import BaardaError, NotEnoughMemory, UsageError
-from baarda.geometry import rotation as rot
 from baarda.hypotheses import run
 from baarda.hypotheses.base import Estimates, Evidence, TestResult
 from baarda.hypotheses.levels import Options
@@ -306,18 +305,7 @@ def variances_of(a: Adjustment) -> Floats:
 
 def errors_of(truth: State, result: Adjustment) -> Floats:
     """Return adjusted minus true unknowns, (u,); for image angles the increments about the camera axes that lead from true to adjusted."""
-    state, out = State.of(result.network), np.empty(result.numbering.count)
-    turn = rot.log(state.rotation @ truth.rotation.transpose(0, 2, 1)) if len(state.rotation) else np.zeros((0, 3))
-    parts = {
-        "camera": np.concatenate([np.zeros(0), *(a - b for a, b in zip(state.cameras, truth.cameras, strict=True))]),
-        "image": np.concatenate([state.position - truth.position, turn], axis=1).ravel(),
-        "point": (state.points - truth.points).ravel(),
-    }
-    parts |= {d.kind: d.departure(truth[d.kind]) for d in state.declared}
-    for group in result.numbering.groups:
-        used = group.columns >= 0
-        out[group.columns[used]] = parts[group.kind][used]
-    return out
+    return State.of(result.network).departure(result.numbering, truth)
 
 
 def groups_of(a: Adjustment) -> tuple[Ints, tuple[str, ...]]:

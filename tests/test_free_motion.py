@@ -1,0 +1,148 @@
+"""Free networks end in their datum, whatever the steps were: by the same way back alone, in both solvers and in parts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import baarda
+from baarda.adjustment.datum import Datum
+from baarda.adjustment.free_motion import brought_back, carried
+from baarda.adjustment.linearize import whitened_misclosures
+from baarda.errors import DatumDefect
+from baarda.formats.camera_positions import with_camera_positions
+from baarda.network import Points, State
+from baarda.procedures.independent_models import block_of_models
+from baarda.procedures.synthetic import synthetic
+from networks import ring, with_distances
+from test_camera_positions import table
+from test_independent_models import measured_models
+
+
+def shifting_strips(folder):
+    free = baarda.adjust(ring(images=8, points=30)).network
+    return with_camera_positions(free, table(folder / "p.csv", free, arm=np.zeros(3)), model="shift")
+
+
+def models():
+    return block_of_models(measured_models(2e-5)[1], Points.make(()), 2e-5)
+
+
+FREE = {
+    "seven freedoms": lambda _: ring(),
+    "brown in pixels": lambda _: synthetic("aerial", 12, points=150, control=0, model="brown").network,
+    "without scale": lambda _: with_distances(ring(), [(0, 1), (2, 3)]),
+    "one known point": lambda _: ring(control=1, fixed_control=True),
+    "strips with shifts": shifting_strips,
+    "models": lambda _: models(),
+}
+
+
+@pytest.fixture(scope="module", params=list(FREE))
+def solved(request, tmp_path_factory):
+    return baarda.adjust(FREE[request.param](tmp_path_factory.mktemp("free")))
+
+
+def state_of(a):
+    return State.of(a.network).shifted(a.shift)
+
+
+def values_of(a, state):
+    return whitened_misclosures(a.network.shifted(a.shift), state, a.groups)
+
+
+def test_free_transformations_change_no_observation(solved):
+    a, state = solved, state_of(solved)
+    before, d = values_of(a, state), a.datum.defect.count
+    rng = np.random.default_rng(2)
+    for size in (1e-3, 0.2, 1.0):
+        motion = a.datum.defect.motions @ rng.standard_normal(d)
+        motion *= size / max(np.linalg.norm(motion[3:6]), abs(motion[6]), 0.01 * np.linalg.norm(motion[:3]))
+        there = carried(state, a.numbering, motion)
+        assert np.abs(there.departure(a.numbering, state)).max() > 1e-4 * size
+        np.testing.assert_allclose(values_of(a, there), before, atol=1e-6)
+        along = a.datum.defect.at(a.numbering, there).basis @ np.full(d, 1e-5)  # a small step along the directions of that state
+        np.testing.assert_allclose(values_of(a, there.moved(a.numbering, along)), before, atol=1e-6)
+
+
+def test_known_values_stay_exactly(solved):
+    a, state = solved, state_of(solved)
+    there = carried(state, a.numbering, a.datum.defect.motions @ np.full(a.datum.defect.count, 0.01))
+    known = a.numbering["point"].columns.reshape(-1, 3) < 0
+    assert np.array_equal(there.points[known], state.points[known], equal_nan=True)
+
+
+@pytest.mark.parametrize("minimal", [False, True])
+def test_a_network_carried_away_is_brought_back(solved, minimal):
+    a, state, datum = solved, state_of(solved), solved.datum
+    if minimal:
+        datum = replace(datum, conditions=None)
+    start = state.moved(a.numbering, 1e-3 * np.random.default_rng(1).standard_normal(a.numbering.count))
+    for scale in (1e-3, 0.1):
+        motion = datum.defect.motions @ np.full(datum.defect.count, 1.0)
+        motion *= scale / max(np.linalg.norm(motion[3:6]), abs(motion[6]), 0.01 * np.linalg.norm(motion[:3]))
+        there = brought_back(carried(state, a.numbering, motion), start, a.numbering, datum)
+        np.testing.assert_allclose(values_of(a, there), values_of(a, state), atol=1e-6)
+        left = there.departure(a.numbering, start)
+        size = np.abs(left).max()
+        assert np.abs(left[datum.held] if minimal else datum.conditions.T @ left).max() <= 1e-9 * max(1.0, size)
+        assert brought_back(there, start, a.numbering, datum) is not None
+
+
+def test_what_cannot_be_brought_back_is_told():
+    a = baarda.adjust(ring())
+    b = np.zeros_like(a.datum.defect.basis)  # conditions over nothing
+    with pytest.raises(DatumDefect, match="back to its datum"):
+        brought_back(state_of(a), state_of(a), a.numbering, replace(a.datum, conditions=b))
+
+
+# ---- adjustments ----------------------------------------------------------------------------------------------------------------------
+
+
+def missed(a):
+    """By how much the conditions of the datum are missed, in mean distances of the network."""
+    start, state = State.of(a.start).shifted(a.shift), state_of(a)
+    left = state.departure(a.numbering, start)
+    if a.datum.conditions is None:
+        return np.abs(left[a.datum.held]).max()
+    points = a.numbering["point"].columns.reshape(-1, 3)
+    return np.abs(left[points].mean(axis=0)).max()
+
+
+def test_lenses_in_pixels_do_not_disturb_the_datum():
+    """Columns of K1 and K2 hold 1e18: what the free transformations do to them must be exactly nothing."""
+    network = synthetic("aerial", 12, points=150, seed=2, control=0, model="brown").network
+    dense, block = (baarda.adjust(network, solver=s) for s in ("dense", "block"))
+    camera = dense.numbering["camera"].columns
+    assert not dense.datum.defect.basis[camera[camera >= 0]].any()
+    assert len(dense.history) == len(block.history) <= 9
+    assert all(h.accepted and h.damping == 0.0 for h in dense.history)
+    assert missed(dense) < 1e-12 and missed(block) < 1e-12
+    np.testing.assert_allclose(block.network.points.coordinates, dense.network.points.coordinates, atol=1e-6)
+    np.testing.assert_allclose(block.points["sX"], dense.points["sX"], rtol=1e-8)
+    np.testing.assert_allclose(block.points["sZ"], dense.points["sZ"], rtol=1e-8)
+
+
+@pytest.mark.parametrize("solver", ["dense", "block"])
+@pytest.mark.parametrize("datum", ["inner", "minimal"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_damped_steps_do_not_move_the_datum(solver, datum, seed):
+    network = synthetic("aerial", 12, points=150, seed=seed, control=0, perturbation=20.0).network
+    found = baarda.adjust(network, solver=solver, datum=datum)
+    assert found.status == "converged" and any(h.accepted and h.damping > 0.0 for h in found.history)
+    assert missed(found) < 1e-9
+    if datum == "inner":
+        good = synthetic("aerial", 12, points=150, seed=seed, control=0).network
+        easy = baarda.adjust(good)
+        assert found.objective == pytest.approx(easy.objective, rel=1e-9)
+        np.testing.assert_allclose(found.redundancy_numbers, easy.redundancy_numbers, atol=1e-7)
+
+
+def test_a_likelihood_keeps_the_datum():
+    found = baarda.adjust(synthetic("aerial", 9, points=120, control=0, model="brown").network, robust="huber")
+    assert found.status == "converged" and missed(found) < 1e-10
+
+
+def test_a_datum_without_freedoms_is_left_alone():
+    a = baarda.adjust(ring(control=4))
+    assert isinstance(a.datum, Datum) and a.datum.defect.motions.shape == (7, 0)
