@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from baarda.adjustment import estimates, tables
 from baarda.adjustment.covariance import Cofactors
 from baarda.adjustment.datum import Datum
+from baarda.adjustment.datum_precision import DatumPrecision, datum_precision
 from baarda.adjustment.far_points import FarPoints, far_points
 from baarda.adjustment.linear_system import Chunk, Linearization
 from baarda.adjustment.linearize import offsets_of
@@ -441,6 +442,11 @@ class Adjustment:
         if self.status != "converged":
             return FarPoints(np.zeros(0, dtype=np.intp), np.zeros(0))
         return far_points(self)
+
+    @cached_property
+    def datum_precision(self) -> DatumPrecision | None:
+        """How well rotation and scale of the whole network are determined; None where they are free or move no unknown."""
+        return None if self.datum.defect.count else datum_precision(self.lin, State.of(self.network).shifted(self.shift))
 
     @cached_property
     def judges(self) -> NDArray[np.bool_]:

@@ -30,6 +30,8 @@ from baarda.report.translation import tr
 Problem = tuple[Tone, str, str, str]  # tone, problem, evidence, suggestion
 
 _WEAK = 0.1  # redundancy number below which an observation is hardly controlled
+_TURN = 0.05  # radians: standard deviation of the orientation of the whole network from which it is weak
+_STRETCH = 0.05  # likewise of its scale
 _FAR = 5.0  # times the median standard deviation
 
 
@@ -212,6 +214,31 @@ def _uncontrolled(analysis: Analysis) -> Iterator[Problem]:
         yield "warn", problem, evidence, advice
 
 
+def _weak_datum(analysis: Analysis) -> Iterator[Problem]:
+    found = analysis.adjustment.datum_precision
+    if found is None:
+        return
+    if found.rotation > _TURN:
+        yield (
+            "warn",
+            "The orientation of the whole network is weak.",
+            say(
+                "rotation about the axis ({axis}): standard deviation {size}° a priori, the network taken as rigid",
+                axis=", ".join(fixed(float(x), 2) for x in found.axis),
+                size=significant(float(np.degrees(found.rotation)), 2),
+            ),
+            "What is known of places (control points, positions of cameras) is rough, or lies almost on a line along this axis: measure "
+            "points beside it, or leave the positions out and adjust a free network.",
+        )
+    if found.scale > _STRETCH:
+        yield (
+            "warn",
+            "The scale of the whole network is weak.",
+            say("standard deviation {size} % a priori, the network taken as rigid", size=significant(100.0 * found.scale, 2)),
+            "What is known of places is rough, or lies close together: measure points farther apart, or a distance.",
+        )
+
+
 def _almost_infinite(analysis: Analysis) -> Iterator[Problem]:
     a = analysis.adjustment
     found = a.far
@@ -338,14 +365,14 @@ def _law(analysis: Analysis) -> Iterator[Problem]:
 
 
 _CHECKS: tuple[Callable[[Analysis], Iterator[Problem]], ...] = (
-    _global, _gross, _snooped, _gathered, _survey, _behind, _almost_infinite, _groups, _systematic, _images, _law, _correlated,
+    _global, _gross, _snooped, _gathered, _survey, _behind, _almost_infinite, _weak_datum, _groups, _systematic, _images, _law, _correlated,
     _superfluous, _uncontrolled, _weak_points, _few_rays, _aside,
 )  # fmt: skip
 
 
 def problems(analysis: Analysis) -> list[Problem]:
     """Return what is wrong or doubtful, the gravest first: tone, problem, evidence, suggestion."""
-    checks = _CHECKS if analysis.converged else (_convergence, _aside)
+    checks = _CHECKS if analysis.converged else (_convergence, _weak_datum, _aside)
     found = [p for check in checks for p in check(analysis)]
     return sorted(found, key=lambda p: ("bad", "warn", "info").index(p[0]))
 
