@@ -8,6 +8,7 @@ import pytest
 import baarda
 from baarda.procedures.synthetic import synthetic
 from baarda.procedures.testing import analyse
+from baarda.report.sections import verdict
 from baarda.report.sections.problems import problems
 from networks import ring, with_distances
 
@@ -60,3 +61,6 @@ def test_the_report_tells_what_is_weak():
     unfinished = analyse(baarda.adjust(on_a_line(20.0)[0], iterations=2))
     assert not unfinished.converged
     assert "The orientation of the whole network is weak." in {p[1] for p in problems(unfinished)}
+    assert [s.subject for s in verdict.sentences(unfinished)] == ["Convergence", "Datum"]
+    firm = analyse(baarda.adjust(on_a_line(0.01)[0], iterations=2))
+    assert [s.subject for s in verdict.sentences(firm)] == ["Convergence"]

@@ -14,6 +14,8 @@ from baarda.network import State
 Floats = NDArray[np.float64]
 
 SMALLEST = 1e-18  # of the largest eigenvalue
+TURN = 0.05  # radians: standard deviation of the orientation from which it is weak
+STRETCH = 0.05  # likewise of the scale
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,16 @@ class DatumPrecision:
     rotation: float
     axis: Floats
     scale: float
+
+    @property
+    def turns(self) -> bool:
+        """Whether the orientation of the network is weak."""
+        return self.rotation > TURN
+
+    @property
+    def stretches(self) -> bool:
+        """Whether the scale of the network is weak."""
+        return self.scale > STRETCH
 
 
 def datum_precision(lin: Linearization, state: State) -> DatumPrecision | None:

@@ -52,7 +52,7 @@ def sections(analysis: Analysis) -> list[Section]:
 
 
 def verdict(analysis: Analysis) -> list[str]:
-    """Return the outcome in five to eight plain sentences; a single one if the adjustment did not converge.
+    """Return the outcome in five to eight plain sentences; one or two if the adjustment did not converge.
 
     Parameters
     ----------

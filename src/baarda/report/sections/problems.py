@@ -30,8 +30,6 @@ from baarda.report.translation import tr
 Problem = tuple[Tone, str, str, str]  # tone, problem, evidence, suggestion
 
 _WEAK = 0.1  # redundancy number below which an observation is hardly controlled
-_TURN = 0.05  # radians: standard deviation of the orientation of the whole network from which it is weak
-_STRETCH = 0.05  # likewise of its scale
 _FAR = 5.0  # times the median standard deviation
 
 
@@ -218,7 +216,7 @@ def _weak_datum(analysis: Analysis) -> Iterator[Problem]:
     found = analysis.adjustment.datum_precision
     if found is None:
         return
-    if found.rotation > _TURN:
+    if found.turns:
         yield (
             "warn",
             "The orientation of the whole network is weak.",
@@ -230,7 +228,7 @@ def _weak_datum(analysis: Analysis) -> Iterator[Problem]:
             "What is known of places (control points, positions of cameras) is rough, or lies almost on a line along this axis: measure "
             "points beside it, or leave the positions out and adjust a free network.",
         )
-    if found.scale > _STRETCH:
+    if found.stretches:
         yield (
             "warn",
             "The scale of the whole network is weak.",

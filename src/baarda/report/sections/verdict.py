@@ -36,10 +36,10 @@ def sentences(analysis: Analysis) -> list[Sentence]:
     Returns
     -------
     list of Sentence
-        Five to eight; one where the adjustment did not converge.
+        Five to eight; one or two where the adjustment did not converge.
     """
     if not analysis.converged:
-        return [_not_converged(analysis)]
+        return [s for s in (_not_converged(analysis), _weak_datum(analysis)) if s is not None]
     parts = (
         _adjusted if analysis.audit is None else _audited,
         _likelihood,
@@ -67,6 +67,23 @@ def _not_converged(analysis: Analysis) -> Sentence:
         ),
         "bad",
         "data",
+    )
+
+
+def _weak_datum(analysis: Analysis) -> Sentence | None:
+    found = analysis.adjustment.datum_precision
+    if found is None or not found.turns:
+        return None
+    size = significant(float(np.degrees(found.rotation)), 2)
+    return Sentence(
+        "Datum",
+        say(
+            "What is known of places hardly determines the orientation of the whole network (a priori standard deviation {size}°): such an "
+            "adjustment is far from linear.",
+            size=size,
+        ),
+        "warn",
+        "problems",
     )
 
 
