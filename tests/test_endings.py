@@ -156,7 +156,7 @@ def test_workers_end_with_the_process_that_began_them(number, tmp_path):
     assert process.stdout.readline() == b"begun\n"
     assert len(alive(process.pid)) >= 3
     process.send_signal(number)
-    process.wait(timeout=10)
+    process.wait(timeout=60)
     process.stdout.close()
     assert gone(process.pid), alive(process.pid)
 
@@ -176,11 +176,11 @@ def test_a_batch_that_is_asked_to_end_leaves_no_process_and_nothing_half_written
 @posix
 def test_workers_that_are_given_up_have_ended():
     with open_workers(jobs=2) as workers:
-        outcomes = workers.run(time.sleep, [0.0, 30.0, 30.0])
+        outcomes = workers.run(time.sleep, [0.0, 300.0, 300.0])
         next(outcomes)
         begun, processes = time.monotonic(), [child.pid for child in multiprocessing.active_children()]
         outcomes.close()
-    assert time.monotonic() - begun < 10.0
+    assert time.monotonic() - begun < 100.0  # does not wait for them
     assert len(processes) == 2
     for process in processes:  # the list of children may lag: the thread of the pool that collects them writes it
         with pytest.raises(ProcessLookupError):

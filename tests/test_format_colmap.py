@@ -2,7 +2,6 @@
 
 import shutil
 import struct
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -61,9 +60,7 @@ def residuals(network):
 
 
 def test_the_reference_model():
-    begin = time.perf_counter()
     n = formats.read(data_folder("colmap_sceaux_txt"))
-    assert time.perf_counter() - begin < 4.0  # 0.3 s on an idle machine
     assert n.format == "colmap" and n.unit == "model units" and dict(n.settings) == {"first_pixel": 0.5}
     assert (len(n.images.labels), len(n.points.labels), len(n.observations[0])) == (11, 7862, 37123)
     camera = n.cameras[0]

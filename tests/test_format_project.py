@@ -3,7 +3,6 @@
 import os
 import random
 import re
-import time
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -282,7 +281,7 @@ def test_distance_groups_and_empty_groups_return(tmp_path):
     same(returned(n, tmp_path / "p"), n)
 
 
-def test_large_table_is_read_fast(tmp_path):
+def test_a_large_table(tmp_path):
     rng = np.random.default_rng(1)
     i, p = np.divmod(np.arange(100_000), 1000)
     network = Network(
@@ -292,10 +291,7 @@ def test_large_table_is_read_fast(tmp_path):
         (ImagePoints.make(i, p, rng.random((100_000, 2)) * 1000),),
     )
     project.write(network, tmp_path / "p")
-    begin = time.perf_counter()
-    again = project.read(tmp_path / "p")
-    assert time.perf_counter() - begin < 3.0  # 0.4 s on an idle machine
-    same(again, network)
+    same(project.read(tmp_path / "p"), network)
 
 
 # --------------------------------------------------------------------------------------------------------- broken input
