@@ -487,6 +487,6 @@ def test_inner_constraints_reach_a_track_over_points_that_are_held(made, monkeyp
     basis = np.zeros((a.numbering.count, 1))
     basis[track[track >= 0][0]] = 1.0
     monkeypatch.setattr("baarda.adjustment.solve.minimal_columns", lambda defect, lin, candidates: candidates[:1])
-    datum = choose_datum(Defect(basis, ("rotation about X",), np.eye(7)[:, 3:4]), a.lin, Settings(), a.network)
+    datum = choose_datum(Defect(basis, ("rotation about X",), np.eye(7)[:, 3:4], False), a.lin, Settings(), a.network)
     assert "over all unknowns" in datum.text
     assert np.isfinite(datum.transfer).all()

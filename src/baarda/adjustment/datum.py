@@ -30,12 +30,15 @@ class Defect:
     free : tuple of str
         The basic transformations that are free each by itself.
     motions : (7, d) array
-        The shifts, rotations (radians) and scalings (shares) that `basis` shows at one state; at any other they are free as well.
+        The shifts, rotations (radians) and scalings (shares) that `basis` shows.
+    steady : bool
+        Whether these are free at every state.
     """
 
     basis: Floats
     free: tuple[str, ...]
     motions: Floats
+    steady: bool
 
     @property
     def count(self) -> int:
@@ -124,13 +127,13 @@ def find_defect(lin: Linearization, state: State) -> Defect:
         squares, g = a.multiply(a).tocsr(), similarity_directions(lin.unknowns, state, used)
         found = free_combinations(*products(lambda w: squares @ w, lambda w: squares.T @ w, lambda x: a @ x, g))
         if not found[0].shape[1]:
-            return Defect(np.zeros((lin.unknowns.count, 0)), (), np.zeros((7, 0)))  # what some rows determine is determined
+            return Defect(np.zeros((lin.unknowns.count, 0)), (), np.zeros((7, 0)), True)  # what some rows determine is determined
     size = mean_distance(state)
     g = similarity_directions(lin.unknowns, state, size=size)
     combinations, free = free_combinations(*products(lin.row_sums, lin.column_sums, lin.times, g))
     if combinations.shape[1]:  # orthonormal by R^-1, not Q: what does not move stays exactly zero (a column of K3 in pixels holds 1e18)
         combinations = combinations @ np.linalg.inv(np.linalg.qr(g @ combinations, mode="r"))
-    return Defect(g @ combinations, free, combinations / np.repeat([1.0, size], [3, 4])[:, None])
+    return Defect(g @ combinations, free, combinations / np.repeat([1.0, size], [3, 4])[:, None], steady(combinations))
 
 
 def products(
@@ -186,6 +189,27 @@ def free_combinations(gross: Floats, net: Floats, image: Floats) -> tuple[Floats
     return combinations, tuple(name for name, p, s in zip(FREEDOMS, present, single, strict=True) if p and s)
 
 
+def steady(combinations: Floats) -> bool:
+    """Return whether the same transformations are free at every state: shifts alone, or all shifts with none or all rotations.
+
+    Others have an axis or a centre, which may move with points that are observed or known in part.
+
+    Parameters
+    ----------
+    combinations : (7, d) array
+        Orthonormal in what they do to the unknowns, rotation and scale stated per mean distance.
+
+    Examples
+    --------
+    >>> steady(np.eye(7)[:, :6]), steady(np.eye(7)[:, 3:6])
+    (True, False)
+    """
+    least = 1e-9 * float(np.linalg.norm(combinations)) if combinations.size else 0.0
+    turning = np.linalg.matrix_rank(combinations[3:], tol=least) if combinations.size else 0
+    rotating = np.linalg.matrix_rank(combinations[3:6], tol=least) if combinations.size else 0
+    return bool(turning == 0 or (combinations.shape[1] - turning == 3 and rotating in (0, 3)))
+
+
 def minimal_columns(defect: Defect, lin: Linearization, candidates: Ints) -> Ints:
     """Choose d unknowns whose fixing removes the defect, best conditioned, sorted.
 
@@ -237,9 +261,10 @@ class Datum:
         g = self.defect.basis
         return np.asarray(np.linalg.solve((self.conditions.T @ g).T, g.T).T)
 
-    def at(self, unknowns: Unknowns, state: State) -> Datum:
-        """Return the same conditions with the free transformations as they change the unknowns at another state."""
-        return replace(self, defect=self.defect.at(unknowns, state))
+    def at(self, lin: Linearization, state: State) -> Datum:
+        """Return the same conditions with the transformations that are free at another state; as they are, if those are more or fewer."""
+        found = self.defect.at(lin.unknowns, state) if self.defect.steady else find_defect(lin, state)
+        return replace(self, defect=found) if found.count == self.defect.count else self
 
     def transform(self, x: Floats) -> Floats:
         """Apply S to vectors of unknowns, (u,) or (u, k)."""

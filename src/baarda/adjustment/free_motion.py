@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from baarda.adjustment.datum import Datum, mean_distance
-from baarda.errors import DatumDefect
 from baarda.geometry import rotation as rot
 from baarda.network import State, Unknowns
 from baarda.network.declared import Declared
@@ -22,10 +21,10 @@ LONGEST = 0.3  # radians, or share of scale, that are gone back at a time
 SHORT = 0.005  # radians, or share of scale, that a step of Runge and Kutta may take
 ROUNDS = 100
 NONE = 1e-13  # of a motion, shifts in units of the network's size
-ROUNDING = 1e-6  # below which Newton's steps that do not shrink are rounding
+SMALL = 1e-6  # below which Newton's steps that do not shrink are rounding, and elsewhere what is left counts as none
 
 
-def brought_back(state: State, start: State, unknowns: Unknowns, datum: Datum) -> State:
+def brought_back(state: State, start: State, unknowns: Unknowns, datum: Datum) -> State | None:
     """Return the state, moved by a transformation that changes no observation, at which the conditions of a datum hold.
 
     Parameters
@@ -35,16 +34,13 @@ def brought_back(state: State, start: State, unknowns: Unknowns, datum: Datum) -
         that the unknowns held are those of the start.
     unknowns : Unknowns
     datum : Datum
+        With the transformations that are free at the state.
 
     Returns
     -------
-    State
-        The same object where the conditions hold.
-
-    Raises
-    ------
-    DatumDefect
-        If no such transformation is found.
+    State or None
+        The same object where the conditions hold; None where no such transformation is found, or where what is free may
+        change on the way.
     """
     b = datum.conditions
     if b is None:
@@ -54,11 +50,14 @@ def brought_back(state: State, start: State, unknowns: Unknowns, datum: Datum) -
     def drift(there: State) -> Floats:
         return np.asarray(b.T @ np.column_stack([there.departure(unknowns, start), datum.defect.at(unknowns, there).basis]))
 
-    return back(state, datum.defect.motions, mean_distance(start), drift, lambda there, motion: carried(there, unknowns, motion))
+    def carry(there: State, motion: Floats) -> State:
+        return carried(there, unknowns, motion)
+
+    return back(state, datum.defect.motions, datum.defect.steady, mean_distance(start), drift, carry)
 
 
-def back(there: S, motions: Floats, size: float, drift: Callable[[S], Floats], carry: Callable[[S, Floats], S]) -> S:
-    """Find by Newton's method the free transformation after which conditions hold.
+def back(there: S, motions: Floats, steady: bool, size: float, drift: Callable[[S], Floats], carry: Callable[[S, Floats], S]) -> S | None:
+    """Find by Newton's method the free transformation after which conditions hold; see `brought_back`.
 
     Parameters
     ----------
@@ -66,30 +65,29 @@ def back(there: S, motions: Floats, size: float, drift: Callable[[S], Floats], c
         A state, or whatever stands for one.
     motions : (7, d) array
         The free transformations, see `baarda.adjustment.datum.Defect`.
+    steady : bool
+        Whether they are free at every state.
     size : float
         Of the network, object units.
     drift : callable
         Returns by how much the conditions are missed, and how the free transformations change that, (d, 1 + d).
     carry : callable
         Moves the state along shifts, rotations and a scaling, (7,).
-
-    Raises
-    ------
-    DatumDefect
-        If it is not found.
     """
     last = np.inf
     for _ in range(ROUNDS):
         missed = drift(there)
         if not np.isfinite(missed).all() or np.linalg.matrix_rank(missed[:, 1:]) < len(missed):
-            break
+            return None
         motion = -motions @ np.linalg.solve(missed[:, 1:], missed[:, 0])
         left = float(np.linalg.norm(motion[:3])) / size + _angle(motion)
-        if left <= NONE or 0.5 * last <= left <= ROUNDING:
+        if left <= NONE or 0.5 * last <= left <= SMALL:
             return there
+        if not steady:
+            return there if left <= SMALL else None
         last = left
         there = carry(there, min(1.0, LONGEST / max(_angle(motion), NONE)) * motion)
-    raise DatumDefect("the iterations led too far from the start values to bring the network back to its datum (choose --datum inner)")
+    return None
 
 
 def carried(state: State, unknowns: Unknowns, motion: Floats) -> State:

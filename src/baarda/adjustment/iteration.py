@@ -193,8 +193,8 @@ def iterate(
                 before, solver, straight = None, None, False
                 continue
         if datum.transfer is not None:
-            datum = datum.at(unknowns, state)
-        step, change = _step(solver, datum, lin.misclosure)
+            datum = datum.at(lin, state)
+        step, change = _step(lin, solver, datum, lin.misclosure)
         squares, bent = float(change @ change), False
         relative, lengthened, plain = control.relative(squares), 1.0, straight
         if control.damping == 0.0 and before is not None and relative < 0.01:
@@ -239,10 +239,13 @@ def _squares(values: Floats) -> float:
         return float(values @ values) if np.isfinite(values).all() else np.inf
 
 
-def _step(solver: Solver, datum: Datum, y: Floats) -> tuple[Floats, Floats]:
+def _step(lin: Linearization, solver: Solver, datum: Datum, y: Floats) -> tuple[Floats, Floats]:
     """Return the step x that fits A x to y best, in the datum asked for, and A x."""
     step, change = solver.least_squares(y)
-    return datum.transform(step), change
+    if datum.transfer is None:
+        return step, change
+    step = datum.transform(step)
+    return step, change if datum.defect.steady else lin.times(step)  # else they may be free at the start only
 
 
 def _full_step(lin: Linearization, datum: Datum, factor: Callable[..., Solver]) -> float:
@@ -263,6 +266,6 @@ def _bent(
     curvature *= 2.0 / h
     if not np.isfinite(curvature).all():
         return step
-    bend = -0.5 * _step(solver, datum, curvature)[0]
+    bend = -0.5 * _step(lin, solver, datum, curvature)[0]
     size = np.linalg.norm(lin.scale * bend) / np.linalg.norm(lin.scale * step)
     return step + bend if size <= 0.375 else step

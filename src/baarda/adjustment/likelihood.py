@@ -121,7 +121,7 @@ def iterate(
         if damping == 0.0:
             step = _newton_step(lin, solver, slope, u, psi, rhs, step, scale)
         if datum.transfer is not None:
-            step = datum.at(lin.unknowns, state).transform(step)
+            step = datum.at(lin, state).transform(step)
         change = lin.times(step)
         relative = float(np.sqrt(change @ (curvature * change) / r) / scale)
         slope_along = float(step @ rhs) / scale**2

@@ -33,6 +33,8 @@ from baarda.observations import ImagePoints, Kind, direct_observations, viewpoin
 
 Floats = NDArray[np.float64]
 DENSE_LIMIT = 1500
+RETURNED = 1e-7  # by what part v'Pv may change where no observation should
+LEFT = " On the way the network was moved away from these constraints, by what changes no observation."
 
 
 @dataclass(frozen=True)
@@ -211,13 +213,15 @@ def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDAr
         found = adjust_under_law(prepared, state, lin, arranged, datum, factor, settings, redundancy, history)
         state, lin, history, converged, law = found
         more = [*more, *law.assumptions]
-    there = brought_back(state, start, unknowns, datum) if converged and defect.count else state
-    if there is not state:
-        state, lin = there, linearize(prepared, there, unknowns, arranged, settings.jobs)
-    if datum.name == "inner":
-        datum = choose_datum(find_defect(lin, state), lin, settings, prepared, far)
-    elif datum.name == "minimal":  # it names what was held
-        datum = datum.at(lin.unknowns, state)
+    left = ""
+    if converged and defect.count:
+        state, lin, left = _in_datum(prepared, start, state, lin, datum.at(lin, state), arranged)
+    present = find_defect(lin, state) if datum.name == "inner" else defect  # a minimal datum names what was held
+    if datum.name == "inner" and present.count == defect.count:
+        datum = choose_datum(present, lin, settings, prepared, far)
+    elif present.count != defect.count:
+        more = [*more, f"The datum defect is that of the start values, {defect.count}; at the result it is {present.count}."]
+    datum = replace(datum, text=datum.text + left)
     memory.release(lin.count)
     solver = factor(lin, datum)
     return Adjustment(
@@ -237,6 +241,21 @@ def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDAr
         shift=shift,
         law=law,
     )
+
+
+def _in_datum(
+    network: Network, start: State, state: State, lin: Linearization, datum: Datum, groups: Arrangement
+) -> tuple[State, Linearization, str]:
+    """Bring a free network back to its datum; return what the datum's text must add where that cannot be done."""
+    there = brought_back(state, start, lin.unknowns, datum)
+    if there is state:
+        return state, lin, ""
+    if there is not None:
+        again = linearize(network, there, lin.unknowns, groups, lin.workers)
+        before, after = (float(some.misclosure @ some.misclosure) for some in (lin, again))
+        if abs(after - before) <= RETURNED * max(before, lin.count * RETURNED):
+            return there, again, ""
+    return state, lin, LEFT
 
 
 def prepare(network: Network, settings: Settings) -> tuple[Network, NDArray[np.bool_], list[str]]:

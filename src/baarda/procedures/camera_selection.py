@@ -16,7 +16,7 @@ from baarda.adjustment.solve import Settings, prepare
 from baarda.cameras import FIXED, OBSERVED
 from baarda.errors import UsageError
 from baarda.hypotheses.levels import Options
-from baarda.network import CHECK, Network, State, unknowns_of
+from baarda.network import Network, State, unknowns_of
 from baarda.procedures.criteria import Fitted
 from baarda.procedures.selection import Fit, Selection, SelectionOptions, select
 
@@ -45,10 +45,10 @@ def apply_settings(network: Network, settings: dict[str, Any]) -> tuple[Network,
     return replace(prepared, settings=kept), {k: v for k, v in settings.items() if k not in done}
 
 
-def check_rms(network: Network, aside: NDArray[np.bool_]) -> float | None:
+def check_rms(a: Adjustment) -> float | None:
     """Return the root mean square of all check coordinates (adjusted - given); None without check points."""
-    points = network.points
-    d = (points.coordinates - points.given)[(points.roles == CHECK) & ~aside]
+    points = a.network.points
+    d = (points.coordinates - points.given)[a.judges]
     d = d[np.isfinite(d)]
     return float(np.sqrt(np.mean(d * d))) if len(d) else None
 
@@ -105,7 +105,7 @@ class CameraModel:
         redundancy = a.redundancy + extra
         trace = a.variance_factor * float(np.einsum("nii->", a.point_cofactors)) if self.with_trace else None
         # An a-priori value of a deleted parameter still is an observation, whose residual is its distance from zero.
-        fitted = Fitted(a.objective + omega, a.count + extra, redundancy, trace, check_rms(a.network, a.aside))
+        fitted = Fitted(a.objective + omega, a.count + extra, redundancy, trace, check_rms(a))
         with threadpool_limits(limits=1, user_api="blas"):
             entering = self._entering(a, deleted, fitted)
         return Fit(names, values, 0.5 * (q + q.T), a.numbering.count, fitted, entering, a)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from baarda.adjustment.datum import free_combinations
+from baarda.adjustment.datum import free_combinations, steady
 from baarda.adjustment.solve import Settings
 from baarda.errors import DatumDefect
 from baarda.procedures import helmert_part as tasks
@@ -83,16 +83,45 @@ def choose_datum(parts: Parts, stands: Handles, settings: Settings, at_start: bo
     held, border, names, pins = _held(parts, stands, basis, free)
     if settings.datum == "minimal":
         text = f"Minimal constraints hold {d} unknown(s) at their start values: {names}."
-        return JointDatum("minimal", d, held, border, None, np.zeros((0, 0)), text, tasks.Tie(parts.joint.size, basis, (), at_start), pins)
+        return JointDatum(
+            "minimal",
+            d,
+            held,
+            border,
+            None,
+            np.zeros((0, 0)),
+            text,
+            tasks.Tie(parts.joint.size, basis, (), basis if at_start else None),
+            pins,
+        )
     kinds: tuple[str, ...] = ("point",)
     far = sum(s.far for s in sums)
     where = "all object points" + (f" but {far} far one(s)" if far else "")
     if np.linalg.matrix_rank(np.concatenate([s.on_points for s in sums]) @ basis) < d:
         kinds, where = ("point", "image"), f"{where} and images"
-    tie = tasks.Tie(parts.joint.size, basis, kinds, at_start)
+    tie = tasks.Tie(parts.joint.size, basis, kinds, basis if at_start else None)
     inverse = np.linalg.inv(parts.total(tasks.gram, stands, tie))
     text = f"Free network: {d} inner constraint(s) over {where} tie down {free}."
     return JointDatum("inner", d, held, border, tie, inverse, text, tie, (np.zeros((0, 2), dtype=np.intp),) * count)
+
+
+def at_present(parts: Parts, stands: Handles, datum: JointDatum) -> JointDatum:
+    """Return the same conditions with the transformations that are free at present, see `baarda.adjustment.datum.Datum.at`."""
+    if datum.tie is None or steady(datum.tie.basis):
+        return datum
+    basis, _, _ = find_defect(parts, stands)
+    return replace(datum, tie=replace(datum.tie, basis=basis)) if basis.shape[1] == datum.count else datum
+
+
+def at_result(parts: Parts, stands: Handles, settings: Settings, datum: JointDatum) -> JointDatum:
+    """Return the datum whose conditions are about the result; a minimal datum, which names what was held, stays."""
+    if datum.tie is None:
+        return datum
+    found = choose_datum(parts, stands, settings, False)
+    if found.count == datum.count:
+        return found
+    tie = replace(datum.tie, start=None)
+    return replace(datum, tie=tie, inverse=np.linalg.inv(parts.total(tasks.gram, stands, tie)))
 
 
 def _held(parts: Parts, stands: Handles, basis: Floats, free: str) -> tuple[tuple[Ints, ...], Ints, str, tuple[Ints, ...]]:

@@ -8,14 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from baarda.adjustment.datum import steady
 from baarda.adjustment.free_motion import back
 from baarda.adjustment.iteration import REUSE, Control, extrapolation
 from baarda.adjustment.result import Iteration
-from baarda.adjustment.solve import Settings
+from baarda.adjustment.solve import LEFT, RETURNED, Settings
 from baarda.errors import RedundancyNotPositive, UsageError
 from baarda.procedures import helmert_part as tasks
 from baarda.procedures.helmert_border import Handles, Joint, Parts, Top
-from baarda.procedures.helmert_datum import JointDatum, choose_datum
+from baarda.procedures.helmert_datum import JointDatum, at_present, at_result, choose_datum
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -124,14 +125,25 @@ class Run:
         cc = self.sums(self.solved(replace(datum, tie=None)), None).cc
         return float(np.sqrt(cc) / max(np.sqrt(objective), 1e-4 * np.sqrt(self.joint.count)))
 
-    def brought_back(self, free: tasks.Tie, pins: Sequence[Ints]) -> Handles:
-        """Return the parts where the conditions of the datum hold, see `baarda.adjustment.free_motion`."""
+    def brought_back(self, free: tasks.Tie, pins: Sequence[Ints]) -> bool:
+        """Bring the parts to where the conditions of the datum hold, see `baarda.adjustment.free_motion`; False if that cannot be done."""
 
         def drift(stands: Handles) -> Floats:
             return np.asarray(self.parts.total(tasks.drift, stands, free, list(pins)))
 
         motions = free.basis / np.repeat([1.0, free.size], [3, 4])[:, None]
-        return back(self.stands, motions, free.size, drift, lambda stands, motion: self.parts.each(tasks.carried_along, stands, motion))
+
+        def carry(stands: Handles, motion: Floats) -> Handles:
+            return self.parts.each(tasks.carried_along, stands, motion)
+
+        there = back(self.stands, motions, steady(free.basis), free.size, drift, carry)
+        if there is self.stands or there is None:
+            return there is not None
+        before, after = (float(self.parts.total(tasks.vpv, stands)) for stands in (self.stands, there))
+        if abs(after - before) > RETURNED * max(before, self.joint.count * RETURNED):
+            return False
+        self.stands = there
+        return True
 
     def solve(self, stands: Handles) -> Blocked:
         """Iterate to the minimum as `baarda.adjustment.iteration.iterate`, and factor there."""
@@ -150,7 +162,7 @@ class Run:
         straight = False  # whether the last step was neither damped nor bent nor lengthened
         old: Handles | None = None
         for _ in range(settings.iterations):
-            datum = None if control.damping > 0.0 else tied
+            datum = None if control.damping > 0.0 else at_present(parts, self.stands, tied)
             self.factor(datum, control.damping, old if control.reuses else None)
             old = None
             steps = self.solved(datum)
@@ -178,8 +190,8 @@ class Run:
                 break
             control.relax(relative)
         old = before = None
-        if converged and tied.free is not None:
-            self.stands = self.brought_back(tied.free, tied.pins)
-        datum = tied if tied.tie is None else choose_datum(parts, self.stands, settings, False)
+        inside = not converged or tied.free is None or self.brought_back(tied.free, tied.pins)
+        datum = at_result(parts, self.stands, settings, tied)
+        datum = datum if inside else replace(datum, text=datum.text + LEFT)
         self.factor(datum, 0.0, None)
         return Blocked(joint, datum, self.stands, self.top, control.objective, redundancy, tuple(control.history), converged)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baarda.adjustment.block import BlockSolver
-from baarda.adjustment.datum import products, similarity_directions
+from baarda.adjustment.datum import products, similarity_directions, steady
 from baarda.adjustment.free_motion import carried
 from baarda.adjustment.linearize import check_finite, whitened_misclosures
 from baarda.adjustment.solve import Settings
@@ -205,24 +205,24 @@ class Tie:
     ----------
     size : float
     basis : (7, d) array
-        The free combinations of the seven similarity directions.
+        The combinations of the seven similarity directions that are free at the present state.
     kinds : tuple of str
         Kinds of unknowns that the constraints are over.
-    at_start : bool
-        Whether the conditions B hold the directions at the start values.
+    start : (7, d) array or None
+        Those at the start values, if the conditions B are about these.
     """
 
     size: float
     basis: Floats
     kinds: tuple[str, ...]
-    at_start: bool
+    start: Floats | None
 
 
 def tied(stand: Stand, tie: Tie) -> tuple[Floats, Floats]:
     """Return the basis G (u, d) and the conditions B (u, d) of a part; rows of the border that another part owns are left out of B."""
     part = stand.part
     g = directions(part, stand.state, tie.size) @ tie.basis
-    b = directions(part, part.start, tie.size) @ tie.basis if tie.at_start else g
+    b = g if tie.start is None else directions(part, part.start, tie.size) @ tie.start
     on = np.zeros(len(g), dtype=bool)
     for kind in tie.kinds:
         on |= _of_kind(part, kind)
@@ -302,8 +302,10 @@ def condition_sums(stand: Stand, step: Step, tie: Tie) -> Floats:
 def transferred(stand: Stand, step: Step, tie: Tie, t: Floats) -> Step:
     """Return the step moved along the free directions, x - G t, into the datum asked for."""
     g, _ = tied(stand, tie)
+    x = step.x - g @ t
+    found = Step(x, step.change if steady(tie.basis) else stand.lin.times(x))  # see `baarda.adjustment.iteration`
     stand.rest()
-    return Step(step.x - g @ t, step.change)
+    return found
 
 
 def drift(stand: Stand, tie: Tie, pins: Ints) -> Floats:
@@ -315,6 +317,13 @@ def drift(stand: Stand, tie: Tie, pins: Ints) -> Floats:
     g, b = tied(stand, tie)
     b[pins[:, 0], pins[:, 1]] = 1.0
     found = np.asarray(b.T @ np.column_stack([stand.state.departure(part.unknowns, part.start), g]))
+    stand.rest()
+    return found
+
+
+def vpv(stand: Stand) -> float:
+    """Return the v'Pv of a part."""
+    found = float(stand.lin.misclosure @ stand.lin.misclosure)
     stand.rest()
     return found
 

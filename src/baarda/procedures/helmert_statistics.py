@@ -196,7 +196,7 @@ class Statistics:
         if tie is not None and k is not None:
             moved = (tied(stand, tie)[0] @ inverse, k, c)
         none = np.zeros(0, dtype=np.intp)
-        defect = Defect(np.zeros((lin.unknowns.count, whole.defect)), (), np.zeros((7, whole.defect)))
+        defect = Defect(np.zeros((lin.unknowns.count, whole.defect)), (), np.zeros((7, whole.defect)), False)
         datum = Datum(whole.datum_name, defect, none, None, whole.datum_text)
         return PartAdjustment(
             network=stand.state.write_to(part.network).shifted(-part.shift),
