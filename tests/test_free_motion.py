@@ -15,6 +15,10 @@ from baarda.formats.camera_positions import with_camera_positions
 from baarda.network import Points, State
 from baarda.procedures.independent_models import block_of_models
 from baarda.procedures.synthetic import synthetic
+from baarda.procedures.testing import analyse
+from baarda.report.result_folder import result_json
+from baarda.report.sections.problems import problems
+from baarda.report.sections.verdict import sentences
 from networks import ring, with_distances
 from test_camera_positions import table
 from test_independent_models import measured_models
@@ -212,3 +216,31 @@ def test_a_likelihood_keeps_the_datum():
 def test_a_datum_without_freedoms_is_left_alone():
     a = baarda.adjust(ring(control=4))
     assert isinstance(a.datum, Datum) and a.datum.defect.motions.shape == (7, 0)
+
+
+# ---- what the report says of it -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("datum", ["inner", "minimal"])
+def test_check_points_judge_nothing_in_a_free_network(datum):
+    """Else a block without errors fails by where it happens to lie."""
+    network = synthetic("aerial", 9, points=150, control=0, checks=10, seed=2).network
+    analysis = analyse(baarda.adjust(network, datum=datum))
+    assert not analysis.adjustment.judges.any() and analysis.adjustment.evidence.check is None
+    assert not {"check_points", "check_point", "check_axis"} & {r.name for r in analysis.tests}
+    assert "Check points judge nothing in a free network." in {p[1] for p in problems(analysis)}
+    assert result_json(analysis)["rms"]["check"] == {}
+    controlled = analyse(baarda.adjust(synthetic("aerial", 9, points=150, checks=10, seed=2).network))
+    assert controlled.adjustment.judges.sum() == 10 and "check_points" in {r.name for r in controlled.tests}
+
+
+def test_the_first_sentence_adds_up():
+    a = baarda.adjust(ring())
+    assert f"{a.count} observations and 7 conditions of the datum determine {a.numbering.count} unknowns" in sentences(analyse(a))[0].text
+    assert a.count + 7 - a.numbering.count == a.redundancy
+
+
+def test_constraints_that_add_nothing_are_told():
+    told = baarda.adjust(ring(control=4), datum="inner").assumptions
+    assert any("inner constraints was asked for" in text for text in told)
+    assert not any("was asked for" in text for text in baarda.adjust(ring(control=4)).assumptions)

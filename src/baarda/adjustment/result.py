@@ -450,8 +450,10 @@ class Adjustment:
 
     @cached_property
     def judges(self) -> NDArray[np.bool_]:
-        """Which points judge as check points: those that took part, but not what cannot be told from infinity."""
+        """Which points judge as check points: those that took part, but not what cannot be told from infinity; none in a free network."""
         out = np.asarray((self.network.points.roles == CHECK) & ~self.aside)
+        if self.datum.defect.count:  # its position, rotation or scale is that of the start values
+            out[:] = False
         if out.any():
             out[self.far.points] = False
         return out

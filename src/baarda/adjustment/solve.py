@@ -173,7 +173,7 @@ def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDAr
     )
     most = max((len(g) for g in groups if isinstance(g, ImagePoints)), default=0)
     if settings.tell is not None and kind == "block" and most >= kernels.COMPILE_FROM and not kernels.cached():
-        settings.tell("compiling loops for the first time, about a quarter of a minute (see: baarda warmup)")
+        settings.tell("compiling loops for the first time, about half a minute in all (see: baarda warmup)")
     rank = rank_for(groups, start.points)
     arranged = Arrangement.of(groups, rank if kind == "block" else None, prepared)
     lin = linearize(prepared, start, unknowns, arranged, settings.jobs)
@@ -208,6 +208,8 @@ def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDAr
             break
         far |= more_far  # a free network must not hang on them: once more from the start
         lin = linearize(prepared, start, unknowns, arranged, settings.jobs)
+    if settings.datum in ("inner", "minimal") and not defect.count:
+        more = [*more, f"A datum by {settings.datum} constraints was asked for; observations and known values define it (defect 0)."]
     law = None
     if settings.robust is not None:
         found = adjust_under_law(prepared, state, lin, arranged, datum, factor, settings, redundancy, history)

@@ -34,4 +34,4 @@ def split(
             typer.echo(
                 f"{p.folder}: {p.images} images, {p.points} points, {p.observations} observations, {len(p.border)} shared nodes", err=True
             )
-        typer.echo(f"{len(made.border)} cameras and images stand in several parts; next: baarda adjust {out} --cluster ADDRESS", err=True)
+        typer.echo(f"{len(made.border)} cameras and images stand in several parts; next: baarda adjust {out} [--cluster ADDRESS]", err=True)

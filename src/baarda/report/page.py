@@ -270,10 +270,10 @@ def overall(analysis: Analysis, made: list[Section]) -> tuple[str, str]:
     if bad:
         return "bad", say("{bad} of {total} statements failed a test", bad=bad, total=len(tones))
     if warn:
-        one = "No test failed; {warn} of {total} statements needs attention"
-        more = "No test failed; {warn} of {total} statements need attention"
+        one = "No statement failed; {warn} of {total} needs attention"
+        more = "No statement failed; {warn} of {total} need attention"
         return "warn", say(one if warn == 1 else more, warn=warn, total=len(tones))
-    return "good", tr("No test failed")
+    return "good", tr("No statement failed")
 
 
 def facts(analysis: Analysis) -> list[tuple[str, str]]:

@@ -163,7 +163,9 @@ def scene_of(analysis: Analysis) -> Scene | None:
     """
     a = analysis.adjustment
     net = a.network
-    use = np.flatnonzero(~a.aside)
+    finite = ~a.aside
+    finite[a.far.points] = False
+    use = np.flatnonzero(finite)
     if not analysis.converged or not net.images.labels or not len(use):
         return None
     e = analysis.evidence

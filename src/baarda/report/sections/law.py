@@ -107,20 +107,18 @@ def _critical(found: CriticalValues) -> list[Block]:
     return [DataTable("Critical values under the law of the errors", columns, tuple(rows), note)]
 
 
-def _two_values(analysis: Analysis, likelihood: float, kurtosis: float) -> Paragraph:
+def _two_values(likelihood: float, kurtosis: float) -> Paragraph:
     """Say why the a by maximum likelihood and that by the kurtosis relation differ."""
-    test = result_of(analysis, "kurtosis_of_residuals")
     return Paragraph(
         say(
-            "Two values of a stand in this section, and they answer two questions. a = {likelihood} is the law of the residuals, by "
-            "maximum likelihood: all residuals speak, most of them near the middle. a = {kurtosis} is the law of the errors behind them, "
-            "from the kurtosis{value}: the fourth moment listens to the tails, and the mixing of errors by the adjustment, which makes "
-            "residuals more normal than errors, is undone. They would agree if the errors were modulated normal and the redundancy high; "
-            "the farther they part, the less a modulated normal law describes middle and tails at once (gross errors left, or groups of "
-            "different precision).",
+            "Two values of a stand in this section, and they answer two questions. a = {likelihood} is the law of the residuals, "
+            "by maximum likelihood: all residuals speak, most of them near the middle. a = {kurtosis} is the law of the errors "
+            "behind them, from their kurtosis through Qvv: the fourth moment listens to the tails, and the mixing of errors by the "
+            "adjustment, which makes residuals more normal than errors, is undone. They would agree if the errors were modulated "
+            "normal and the redundancy high; the farther they part, the less a modulated normal law describes middle and tails at "
+            "once (gross errors left, or groups of different precision).",
             likelihood=significant(likelihood, 2),
             kurtosis=significant(kurtosis, 2),
-            value="" if test is None else f" {fixed(float(test.details['kurtosis']), 2)}",
         )
     )
 
@@ -160,7 +158,7 @@ def _build(analysis: Analysis) -> list[Block] | None:
     if study.critical is not None:
         blocks += _critical(study.critical)
         if laws.modulated is not None:
-            blocks.append(_two_values(analysis, float(laws.modulated.parameters["a"]), float(study.critical.law.parameters["a"])))
+            blocks.append(_two_values(float(laws.modulated.parameters["a"]), float(study.critical.law.parameters["a"])))
     blocks += _moments(analysis)
     if study.scale_rules:
         blocks.append(scale_table(study.scale_rules))

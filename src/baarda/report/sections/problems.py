@@ -324,6 +324,19 @@ def _aside(analysis: Analysis) -> Iterator[Problem]:
         yield "info", problem, names(labels, 10), "They have too few rays, or no observation at all; nothing is said about them."
 
 
+def _unrelated(analysis: Analysis) -> Iterator[Problem]:
+    a = analysis.adjustment
+    check = np.flatnonzero((a.network.points.roles == CHECK) & ~a.aside)
+    if len(check) and a.datum.defect.count:
+        yield (
+            "warn",
+            "Check points judge nothing in a free network.",
+            say("{count}; datum defect {d}", count=plural(len(check), "check point"), d=a.datum.defect.count),
+            "What the observations leave free of position, rotation and scale is that of the start values, not that of the survey: add "
+            "control points, or let some of the check points be control.",
+        )
+
+
 def _survey(analysis: Analysis) -> Iterator[Problem]:
     count = int(analysis.adjustment.judges.sum())
     check, control = result_of(analysis, "check_points"), result_of(analysis, "control_points")
@@ -363,8 +376,8 @@ def _law(analysis: Analysis) -> Iterator[Problem]:
 
 
 _CHECKS: tuple[Callable[[Analysis], Iterator[Problem]], ...] = (
-    _global, _gross, _snooped, _gathered, _survey, _behind, _almost_infinite, _weak_datum, _groups, _systematic, _images, _law, _correlated,
-    _superfluous, _uncontrolled, _weak_points, _few_rays, _aside,
+    _global, _gross, _snooped, _gathered, _unrelated, _survey, _behind, _almost_infinite, _weak_datum, _groups, _systematic, _images,
+    _law, _correlated, _superfluous, _uncontrolled, _weak_points, _few_rays, _aside,
 )  # fmt: skip
 
 

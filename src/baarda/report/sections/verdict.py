@@ -89,11 +89,13 @@ def _weak_datum(analysis: Analysis) -> Sentence | None:
 
 def _adjusted(analysis: Analysis) -> Sentence:
     a = analysis.adjustment
+    d = a.datum.defect.count
     text = say(
-        "The adjustment converged in {steps}: {n} observations determine {u} unknowns with a redundancy of {r}, {share} per "
+        "The adjustment converged in {steps}: {n} observations{datum} determine {u} unknowns with a redundancy of {r}, {share} per "
         "observation on average.",
         steps=plural(len(a.history) - 1, "iteration"),
         n=a.count,
+        datum=say(" and {count} of the datum", count=plural(d, "condition")) if d else "",
         u=a.numbering.count,
         r=a.redundancy,
         share=fixed(a.redundancy / a.count, 2),
