@@ -443,3 +443,8 @@ def test_start_values_are_those_of_the_source():
 def test_memory_can_be_handed_back_at_any_size():
     memory.release(0)
     memory.release(memory.MANY)
+
+
+def test_what_no_point_can_satisfy_is_named():
+    with pytest.raises(RedundancyNotPositive, match=r"no observation takes part: no point has 99 rays or more \(--min-rays\)"):
+        baarda.adjust(ring(), min_rays=99)

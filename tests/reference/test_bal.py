@@ -129,3 +129,10 @@ def test_damaged_packing_is_refused(tmp_path):
         path.write_bytes(pack(SMALL.encode() * 50)[:-20])
         with pytest.raises(InputError, match="damaged"):
             read(path, format="bal")
+
+
+def test_a_folder_of_files_names_those_that_can_be_read(data):
+    with pytest.raises(
+        InputError, match=r"of the files in it, give one: dubrovnik-3-7-18-pre\.txt \(bal\), dubrovnik-3-7-pre\.txt \(bal\)"
+    ):
+        read(data("bal_dubrovnik_tiny"))

@@ -160,6 +160,8 @@ def _adjust(network: Network, settings: Settings, prepared: Network, aside: NDAr
     source, shift = prepared, -prepared.centroid()
     prepared = prepared.shifted(shift)
     groups = active_groups(prepared, ~aside)
+    if not groups:
+        raise RedundancyNotPositive(f"no observation takes part: no point has {max(settings.min_rays, 1)} rays or more (--min-rays)")
     unknowns = unknowns_of(prepared, ~aside, np.isin(np.arange(len(prepared.cameras)), prepared.images.cameras))
     if not unknowns.count:
         raise UsageError("nothing to adjust: all unknowns are fixed")

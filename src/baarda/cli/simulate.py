@@ -147,9 +147,7 @@ def make(kind: str, images: int, out: Path | None, quiet: bool, options: dict[st
     write(block.network, out)
     if not quiet:
         rows = sum(len(g) for g in block.network.observations)
-        typer.echo(
-            f"{out}: {images} images, {len(block.network.points.labels)} object points, {rows} observations (image points, distances)"
-        )
+        typer.echo(f"{out}: {images} images, {len(block.network.points.labels)} object points, {rows} image points and distances")
 
 
 def make_radar(out: Path | None, quiet: bool, points: int, noise: float, seed: int) -> None:

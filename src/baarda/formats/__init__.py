@@ -14,6 +14,8 @@ from baarda.network import Network
 
 __all__ = ["Format", "formats", "read", "recognise", "write"]
 
+_LOOKED_AT = 50  # files of a folder that no format knows
+
 
 def formats() -> dict[str, Format]:
     """Return all file formats by name."""
@@ -36,10 +38,21 @@ def recognise(path: Path) -> Format:
     except OSError as error:
         raise unreadable(error, path) from None
     if not found:
-        raise InputError(f"no known format recognises it; known are {', '.join(formats())} (choose with --format)", path)
+        held = _files_inside(path)
+        inside = f"; of the files in it, give one: {', '.join(held)}" if held else ""
+        raise InputError(f"no known format recognises it{inside}; known are {', '.join(formats())} (choose with --format)", path)
     if len(found) > 1:
         raise InputError(f"several formats recognise it ({', '.join(f.name for f in found)}); choose with --format", path)
     return found[0]
+
+
+def _files_inside(path: Path) -> list[str]:
+    """Return the first files of a folder that a format recognises, with its name."""
+    if not path.is_dir():
+        return []
+    files = sorted(p for p in path.iterdir() if p.is_file() and not p.is_symlink() and p.stat().st_size)[:_LOOKED_AT]
+    found = ((p, next((f.name for f in formats().values() if f.recognises(p)), None)) for p in files)
+    return [f"{p.name} ({name})" for p, name in found if name is not None][:3]
 
 
 def _exists(path: Path) -> None:
