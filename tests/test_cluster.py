@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
@@ -15,7 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from baarda.cli import app
-from baarda.errors import MissingExtra, UsageError
+from baarda.errors import MissingExtra, OutputError, UsageError
 from baarda.executors import ClusterLost, TaskFailed, Workers, memory_limit, open_workers
 from baarda.formats.residual_lake import open_lake
 from baarda.procedures import batch
@@ -139,6 +140,29 @@ def test_any_executor():
     with pytest.raises(TaskFailed, match=r"numbers.txt, line 3: odd") as found:
         out[1].result()
     assert found.value.exit_code == 2 and out[1].failure.kind == "InputError"
+
+
+@pytest.mark.parametrize("ahead", [None, 2])
+def test_what_failed_on_a_worker_is_repeated_alone(ahead):
+    """Beside other tasks it would wait for the worker that is well, and the idle one that failed could steal it."""
+    lock, running, failed, beside = threading.Lock(), set(), set(), {}
+
+    def work(i):
+        with lock:
+            running.add(i)
+        time.sleep(0.01)
+        with lock:
+            running.discard(i)
+            if i in (0, 3) and i not in failed:
+                failed.add(i)
+                raise OutputError("full")
+            if i in failed:
+                beside[i] = set(running)
+        return i
+
+    with ThreadPoolExecutor(2) as pool, open_workers(pool) as workers:
+        done = [o.result() for o in workers.run(work, list(range(8)), ahead, again=("OutputError",))]
+    assert sorted(done) == list(range(8)) and beside == {0: set(), 3: set()}
 
 
 def test_window_is_kept():

@@ -144,7 +144,7 @@ class Workers:
             No task is begun so many places or more after the first one that has not been yielded; no limit by default.
         again : sequence of str
             Kinds of failures that may be the worker's own, such as a full disk: the task is tried once more, by another worker if there
-            is one.
+            is one, when no other task is at work.
 
         Yields
         ------
@@ -283,6 +283,7 @@ class _Futures(Workers):
         done: queue.SimpleQueue[int] = queue.SimpleQueue()
         futures: dict[int, Any] = {}
         repeated, yielded = set[int](), bytearray(len(items))
+        repeats = deque[tuple[int, str]]()
         first = following = 0
 
         def submit(i: int, avoid: str = "") -> None:
@@ -295,6 +296,8 @@ class _Futures(Workers):
                 while following < len(items) and len(futures) < most and (ahead is None or following - first < ahead):
                     submit(following)
                     following += 1
+                if repeats and not futures:  # alone: an idle worker, perhaps the one that failed, steals what waits for a busy one
+                    submit(*repeats.popleft())
                 try:
                     i = done.get(timeout=_LOOK)
                 except queue.Empty:
@@ -303,7 +306,7 @@ class _Futures(Workers):
                 outcome = self._ended(i, futures.pop(i))
                 if outcome.failure is not None and outcome.failure.kind in again and i not in repeated:
                     repeated.add(i)
-                    submit(i, outcome.failure.worker)
+                    repeats.append((i, outcome.failure.worker))
                     continue
                 yield outcome
                 yielded[i] = 1
