@@ -67,7 +67,7 @@ class Cluster:
         self.workers = []
         self.more(workers)
         deadline = time.monotonic() + 60
-        while not file.exists():
+        while not (file.exists() and file.read_text().rstrip().endswith("}")):  # begun, and written to its end
             assert time.monotonic() < deadline, (folder / "log").read_text()
             time.sleep(0.05)
         self.address = json.loads(file.read_text())["address"]
