@@ -83,8 +83,7 @@ def test_axes_that_move_with_points_lead_nowhere_else(name, datum):
         assert found.status == "converged" and 0 < found.datum.defect.count < 7 and not found.datum.defect.steady
         assert found.objective == pytest.approx(least, rel=1e-7)
         assert found.history[-1].objective == pytest.approx(found.objective, rel=1e-9)
-        damped = any(h.accepted and h.damping > 0.0 for h in found.history)
-        assert damped or LEFT not in found.datum.text or missed(found) > 1e-7
+        assert LEFT in found.datum.text or missed(found) < 1e-4
         np.testing.assert_allclose(found.redundancy_numbers.sum(), found.redundancy, rtol=1e-9)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,9 +51,11 @@ def _files_inside(path: Path) -> list[str]:
     """Return the first files of a folder that a format recognises, with its name."""
     if not path.is_dir():
         return []
-    files = sorted(p for p in path.iterdir() if p.is_file() and not p.is_symlink() and p.stat().st_size)[:_LOOKED_AT]
-    found = ((p, next((f.name for f in formats().values() if f.recognises(p)), None)) for p in files)
-    return [f"{p.name} ({name})" for p, name in found if name is not None][:3]
+    out = []
+    for file in sorted(p for p in path.iterdir() if p.is_file() and not p.is_symlink())[:_LOOKED_AT]:
+        with suppress(OSError):  # what cannot be read is no hint
+            out += [f"{file.name} ({f.name})" for f in formats().values() if file.stat().st_size and f.recognises(file)][:1]
+    return out[:3]
 
 
 def _exists(path: Path) -> None:
